@@ -18,7 +18,7 @@ from mpi4py import MPI
 
 from .case.model import INTEGRATORS
 from .case.tables import Modes
-from .contact.monitoring import small_walls
+from .contact.bars_at_walls import small_walls
 from .contact.neighbours import Points, Segments, find_pairs
 from .errors import PfemError
 from .files import memory_of_machine

@@ -1,9 +1,9 @@
-"""Walls and the nodes that they stop: search, candidates of implicit steps, nodes that start beyond walls."""
+"""Walls and the nodes that they stop: search, candidates of implicit steps, nodes that start or come beyond walls."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from mpi4py import MPI
@@ -14,7 +14,7 @@ from ..parallel.agreement import agreed
 from ..tolerances import BEYOND, ON_BOUND
 from .explicit import ExplicitContact
 from .frames import MIN_VOLUME, NodalFrames, Planes, RowPlanes, build_frames
-from .node_walls import WallForces
+from .node_walls import WallForces, held_by_supports
 from .surfaces import OTHER
 from .tied import FreshTies
 from .wall_motion import Poses
@@ -22,9 +22,6 @@ from .wall_motion import Poses
 if TYPE_CHECKING:
     from ..case.schema import Case
     from ..mesh.distribution import DistributedMesh
-
-
-_NO_ROWS = RowPlanes.none(0)
 
 
 class Contact(ExplicitContact):
@@ -56,30 +53,24 @@ class Contact(ExplicitContact):
         return self.ties.take(walls.nodes, walls.touching, walls.places, time)
 
     def frames(
-        self,
-        candidates: Candidates,
-        x: np.ndarray,
-        time: float,
-        least: float = MIN_VOLUME,
-        part: float = 1.0,
-        rows: RowPlanes = _NO_ROWS,
+        self, candidates: Candidates, x: np.ndarray, balance: Balance, rows: RowPlanes, least: float = MIN_VOLUME
     ) -> NodalFrames:
         """Build coordinates and bounds of candidates from their planes at positions (owned, 3). Collective.
 
-        ``least``: see :func:`~pfem_petsc.contact.frames.build_frames`; ``part``: see :meth:`acting`; ``rows``: further
-        planes of some of the candidates.
+        ``rows``: further planes of the candidates; ``least``: see :func:`~pfem_petsc.contact.frames.build_frames`.
         """
-        nodes, rank = candidates.nodes, candidates.priority
-        at, poses = x[nodes], self.motion.poses(time)
-        self.find_faces(nodes, at, poses, ON_BOUND * self.size)
-        acting = self.acting(nodes, at, poses, part)
+        nodes, poses, tolerance = candidates.nodes, self.motion.poses(balance.time), ON_BOUND * self.size
+        at = x[nodes]
+        self.find_faces(nodes, at, poses, tolerance)
+        acting = self.acting(nodes, at, poses, balance.acting)
         normals, offsets = self.planes(candidates.applicable, at, poses, acting, nodes)
-        if rank is None:
-            rank = np.einsum("iwk,ik->iw", normals, at) - offsets
-        tolerance, walls = ON_BOUND * self.size, offsets.shape[1]
-        if rows.offsets.shape[1]:
-            normals, offsets, rank, at = rows.beside(nodes, (normals, offsets, rank, at))
-        frames = build_frames(nodes, Planes(self.fixed[nodes], normals, offsets, rank, at), tolerance, least)
+        walls = offsets.shape[1]
+        normals = np.concatenate([normals, rows.normals], axis=1)
+        offsets = np.concatenate([offsets, rows.offsets], axis=1)
+        rank = np.einsum("iwk,ik->iw", normals, rows.places) - offsets
+        if candidates.priority is not None:
+            rank[:, :walls] = candidates.priority
+        frames = build_frames(nodes, Planes(self.fixed[nodes], normals, offsets, rank, rows.places), tolerance, least)
         with agreed(self.mesh.comm):
             if frames.contradiction >= 0:
                 node = frames.contradiction
@@ -96,15 +87,12 @@ class Contact(ExplicitContact):
         residual : (m, 3) residual of the frames' nodes in their coordinates [N]
         active : (m, 3) int8: -1 on the lower bound, +1 on the upper, 0 on none
         """
-        strengths = np.zeros(frames.rows.shape)
-        every = np.arange(len(frames.nodes))
+        strengths, every = np.zeros(frames.rows.shape), np.arange(len(frames.nodes))
         left = np.where(active != 0, residual, 0.0)
         for k in range(frames.rows.shape[1]):
-            row = frames.rows[:, k]
-            ratio = frames.ratios[:, k]
+            safe, ratio = np.maximum(frames.rows[:, k], 0), frames.ratios[:, k]
             sign = np.sign(ratio)
-            safe = np.maximum(row, 0)
-            touching = (row >= 0) & (active[every, safe] == -sign)
+            touching = (frames.rows[:, k] >= 0) & (active[every, safe] == -sign)
             # of almost parallel walls that share a row, take the nearest
             bound = np.where(sign > 0.0, frames.lower[every, safe], frames.upper[every, safe])
             touching &= sign * (bound - frames.bounds[:, k]) <= ON_BOUND * self.size
@@ -150,33 +138,22 @@ class Candidates:
         strengths : (m, slots) normal forces on the present candidates [N]
         largest_rank : offset that orders walls that press before all open ones [m]
         """
-        nodes = np.union1d(self.nodes, joined)
-        applicable = np.zeros((len(nodes), len(contact.wall_of)), dtype=bool)
-        applicable[np.searchsorted(nodes, joined)] = broken
-        place = np.searchsorted(nodes, self.nodes)
-        applicable[place] |= self.applicable
+        wider = self.beside(joined)
+        nodes, applicable = wider.nodes, wider.applicable
+        applicable[np.searchsorted(nodes, joined)] |= broken
         _, priority = contact.distances(applicable, x[nodes], poses, nodes)
-        normal_forces = strengths > 0.0
-        largest = max(float(strengths.max(initial=0.0)), 1e-300)
-        held = priority[place]
-        held[normal_forces] = -largest_rank * (1.0 + strengths[normal_forces] / largest)
-        priority[place] = held
+        pressed, slot = np.nonzero(strengths > 0.0)
+        shares = strengths[pressed, slot] / strengths.max(initial=1e-300)
+        priority[np.searchsorted(nodes, self.nodes[pressed]), slot] = -largest_rank * (1.0 + shares)
         return Candidates(nodes, applicable, priority)
 
     def beside(self, nodes: np.ndarray) -> Candidates:
         """Return the candidates and further nodes (k,) that no wall stops, for rows; there are some anywhere."""
         every = np.union1d(self.nodes, nodes)
         at, shape = np.searchsorted(every, self.nodes), (len(every), self.applicable.shape[1])
-        applicable, priority = np.zeros(shape, dtype=bool), None
-        applicable[at] = self.applicable
-        if self.priority is not None:
-            priority = np.zeros(shape)
-            priority[at] = self.priority
-        return Candidates(every, applicable, priority)
-
-    def without(self, held: np.ndarray) -> Candidates:
-        """Return the candidates with no applicable walls at tied nodes, ``held`` (owned,) bool."""
-        return replace(self, applicable=self.applicable & ~held[self.nodes][:, None])
+        applicable, priority = np.zeros(shape, dtype=bool), np.zeros(shape)
+        applicable[at], priority[at] = self.applicable, 0.0 if self.priority is None else self.priority
+        return Candidates(every, applicable, None if self.priority is None else priority)
 
 
 def expected_candidates(contact: Contact, state: State, balance: Balance, held: np.ndarray, poses: Poses) -> Candidates:
@@ -195,22 +172,16 @@ def expected_candidates(contact: Contact, state: State, balance: Balance, held: 
     if contact.mesh.comm.allreduce(int(near.any()), op=MPI.MAX) == 0:
         return nobody
     nodes = np.flatnonzero(near)
-    return Candidates(nodes, _within_reach(contact, state, nodes, (state.position + move)[nodes], poses, reach[nodes]))
-
-
-def _within_reach(
-    contact: Contact, state: State, nodes: np.ndarray, x: np.ndarray, poses: Poses, reach: np.ndarray
-) -> np.ndarray:
-    """Return (m, slots) bool: walls that nodes (m,) moving to (m, 3) touch or come within reach (m,) [m] of."""
+    x = state.position[nodes] + move[nodes]
     applicable = contact.applicable(nodes, x, poses)
-    within = np.zeros_like(applicable)
+    within = np.zeros_like(applicable)  # walls that they touch or come within reach of
     starts = state.position[nodes], contact.motion.poses(state.time), BEYOND * contact.size
-    for place, there, distance in ((x, poses, reach[:, None]), starts):
+    for place, there, distance in ((x, poses, reach[nodes, None]), starts):
         within |= contact.distances(applicable, place, there)[1] < distance
     for k in contact.surfaces_of_triangles:  # whose other faces are found when nodes touch them
-        slots = slice(contact.first[k], contact.first[k] + contact.walls[k].faces)
+        slots = contact.slots(k)
         within[:, slots] = within[:, slots].any(axis=1, keepdims=True)
-    return within & applicable
+    return Candidates(nodes, within & applicable)
 
 
 def adjust_start(case: Case, nodes: dict[str, np.ndarray], mesh: DistributedMesh) -> int:
@@ -275,3 +246,102 @@ def check_start(contact: Contact, x: np.ndarray, length: float, adjusts: bool = 
             f"m beyond the wall ({count} node{'s' if count > 1 else ''} in all); move the wall or the mesh, "
             f"{side}, name the nodes that it applies to with 'node_set', or {remedy}"
         )
+
+
+def check_positions(model: Any, x: np.ndarray, time: float, where: str) -> None:
+    """Check that no node lies beyond a wall, with one pass over the nodes and one reduction. Collective.
+
+    Parameters
+    ----------
+    model : Model
+    x : (owned, 3) positions [m] at a time [s] at which contact holds
+    where : the step, for the message
+
+    Raises
+    ------
+    SimulationFailure
+        On all ranks, with the wall, its deepest node and depth, the number of nodes, the step, and the remedy.
+    """
+    contact, comm = model.contact, model.comm
+    found = contact.deepest(x, time, BEYOND * max(model.size, model.reach)) if contact.any else None
+    if found is None:
+        return
+    depth, node, wall, count = found
+    own = np.flatnonzero(model.mesh.node_ids[: len(x)] == node)
+    if comm.allreduce(len(own) > 0 and _prescribed(contact, own[0], wall, x, time)):
+        raise SimulationFailure(_told(where, node, depth, contact.names[wall], count))
+    treatment = model.case.contact.treatment
+    others = f'contact.treatment = "scheme" instead of "{treatment}"'
+    others = others if treatment != "scheme" else "another contact.treatment or time.integrator"
+    raise SimulationFailure(
+        f"{where}: node {node} is {depth:.3g} m beyond wall {contact.names[wall]!r} "
+        f"({count} node{'s' if count > 1 else ''} in all), which contact did not prevent: results since it "
+        f"passed the wall are wrong; reduce time.step, or use {others}"
+    )
+
+
+def _told(where: str, node: int, depth: float, wall: str, count: int) -> str:
+    """Return the message about nodes that supports move beyond a wall."""
+    return (
+        f"{where}: node {node} is {depth:.3g} m beyond wall {wall!r} "
+        f"({count} node{'s' if count > 1 else ''} in all), moved there by its supports; let the wall move with "
+        "the supports, name the nodes that it stops with 'node_set', or do not tie them"
+    )
+
+
+class CarriedNodes:
+    """Nodes of this rank whose motion along the normal of a rectangle is prescribed, so that contact cannot stop them.
+
+    Only the step in which a node crosses shows that it did not come from beside or behind, so every step is checked.
+
+    Attributes
+    ----------
+    of : index of each rectangle that applies to such nodes, to these nodes (k,)
+    """
+
+    def __init__(self, contact: Contact) -> None:
+        self._contact = contact
+        self._before: dict[int, np.ndarray] = {}
+        self.of: dict[int, np.ndarray] = {}
+        for k, wall in enumerate(contact.walls):
+            if wall.partial:
+                held = held_by_supports(contact.fixed, wall.normal) | (
+                    contact.fixed.any(axis=1) & contact.motion.turning[k]
+                )
+                nodes = np.flatnonzero(contact.members[:, contact.first[k]] & held)
+                self.of |= {k: nodes} if len(nodes) else {}
+
+    def start(self, x: np.ndarray, time: float) -> None:
+        """Keep where they are at the start of a step, from all positions (owned, 3) [m] at a time [s]."""
+        if self.of:
+            self._before = self._places(x, time)
+
+    def _places(self, x: np.ndarray, time: float) -> dict[int, np.ndarray]:
+        """Return their positions (k, 3) [m] relative to the rectangles, from all positions (owned, 3)."""
+        poses = self._contact.motion.poses(time)
+        return {k: poses.rest(k, x[nodes]) for k, nodes in self.of.items()}
+
+    def crossing(self, x: np.ndarray, time: float, where: str) -> str | None:
+        """Return the message about nodes that have crossed a rectangle since :meth:`start`, None if there are none."""
+        contact, tolerance = self._contact, BEYOND * self._contact.size
+        after = self._places(x, time)
+        for k, nodes in self.of.items():
+            wall = contact.walls[k]
+            depth = wall.offset - after[k] @ wall.normal
+            crossed = (depth > tolerance) & wall.stops(self._before[k], after[k], np.full(len(nodes), tolerance))
+            if crossed.any():
+                at = int(np.argmax(np.where(crossed, depth, 0.0)))
+                node = int(contact.mesh.node_ids[nodes[at]])
+                return _told(where, node, float(depth[at]), contact.names[k], int(crossed.sum()))
+        return None
+
+
+def _prescribed(contact: Contact, node: int, wall: int, x: np.ndarray, time: float) -> bool:
+    """Return whether supports prescribe an owned node along a wall's normal, or some components of a tied node.
+
+    ``x`` (owned, 3) : positions [m]
+    """
+    if contact.ties.any and contact.ties.held[node] and contact.fixed[node].any():
+        return True
+    normals, _ = contact.planes(np.ones((1, len(contact.wall_of)), dtype=bool), x[[node]], contact.motion.poses(time))
+    return bool(held_by_supports(contact.fixed[node], normals[0, contact.first[wall]]))

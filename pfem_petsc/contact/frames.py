@@ -1,17 +1,23 @@
-"""Bounds on nodal coordinates for implicit steps, the oblique coordinates that turn planes into bounds, and friction
-of slipping nodes.
+"""Bounds on nodal coordinates for implicit steps, the oblique coordinates that turn planes into bounds, friction of
+slipping nodes, and relative coordinates of the nodes of rows.
 """
 
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple, Self
 
 import numpy as np
+from mpi4py import MPI
 
-from ..mechanics.compiled import kernel
+from ..mechanics.compiled import inlined, kernel
 from ..tolerances import FREE_PART
+from .rotations import along, cross, dot, free_components, minus, put, times, vector
 
+if TYPE_CHECKING:
+    from .rows import Alike, RowSet
+
+_LEAST = 0.05  # of a pivot below which a row is deferred
 _SINGULAR = 1e-6  # determinant of I - C below which a wedge is jammed
 
 
@@ -70,24 +76,21 @@ class Sliding:
             factor = friction[:, k] / ratios[:, k]
             coupling[every, :, np.maximum(rows[:, k], 0)] += factor[:, None] * turned[:, k]
         system = np.eye(3) - coupling
-        jammed = np.abs(np.linalg.det(system)) < _SINGULAR
-        system[jammed] = np.eye(3)
+        system[np.abs(np.linalg.det(system)) < _SINGULAR] = np.eye(3)
         self.maps = np.linalg.inv(system)
         g = np.einsum("mij,mj->mi", self.maps, g - np.einsum("mji,mj->mi", self.inverse, known))
         # the change of friction as the direction of slip turns
-        self.stiffness[:] = 0.0
-        for k in range(rows.shape[1]):
-            normal_forces = np.maximum(g[every, np.maximum(rows[:, k], 0)] / ratios[:, k], 0.0)
-            factor = friction[:, k] * normal_forces * weight / size[:, k]
-            n, d = normals[:, k], directions[:, k]
-            across = np.eye(3) - n[:, :, None] * n[:, None, :] - d[:, :, None] * d[:, None, :]
-            self.stiffness += factor[:, None, None] * across
+        normal_forces = np.maximum(np.take_along_axis(g, np.maximum(rows, 0).astype(np.int64), axis=1) / ratios, 0.0)
+        factor = friction * normal_forces * weight[:, None] / size
+        outer = np.einsum("mwi,mwj->mwij", normals, normals) + np.einsum("mwi,mwj->mwij", directions, directions)
+        self.stiffness[:] = np.einsum("mw,mwij->mij", factor, np.eye(3) - outer)
         return g
 
 
 MIN_VOLUME = 0.04  # of the rows of B: cond(B) <= 2.6/0.04 = 65; two planes can share a node from 2.3 degrees
 _PARALLEL = 1e-14  # 1 - |cos| of free parts of normals that share a row; the bound is exact only at the given position
 _ALONG = 1e-15  # components of a unit normal off an axis that count as zero
+_AXES = np.eye(3)
 
 
 class NodalFrames:
@@ -155,37 +158,181 @@ class Planes(NamedTuple):
 
 
 class RowPlanes(NamedTuple):
-    """Rows as planes n . y >= d of owned nodes (m,), ascending, with one slot for each table (t,).
+    """Rows as planes n . y >= d of nodes (m,), with one slot for each table (t,).
 
     Attributes
     ----------
-    nodes : (m,) owned local indices; places : (m, 3) y at these [m]
+    places : (m, 3) y [m], the positions of nodes without rows
     normals, offsets : (m, t, 3), (m, t) [m]; offsets -inf where a table has no row
     """
 
-    nodes: np.ndarray
     places: np.ndarray
     normals: np.ndarray
     offsets: np.ndarray
 
     @classmethod
-    def none(cls, tables: int) -> RowPlanes:
+    def none(cls, places: np.ndarray, tables: int) -> Self:
         """Return the planes of no rows."""
-        vectors = np.empty((0, 3))
-        return cls(np.empty(0, dtype=np.int64), vectors, np.empty((0, tables, 3)), np.empty((0, tables)))
+        return cls(places, np.zeros((len(places), tables, 3)), np.full((len(places), tables), -np.inf))
 
-    def beside(self, nodes: np.ndarray, walls: tuple[np.ndarray, ...]) -> tuple[np.ndarray, ...]:
-        """Append the slots of tables to ``walls``, the normals, offsets and ranks (k, w) and places (k, 3) of nodes
-        (k,), ascending, which include those of the rows."""
-        normals, offsets, rank, places = walls
-        at, tables = np.searchsorted(nodes, self.nodes), self.offsets.shape[1]
-        own = np.zeros((len(nodes), tables, 3)), np.full((len(nodes), tables), -np.inf), np.zeros((len(nodes), tables))
-        own[0][at], own[1][at] = self.normals, self.offsets
-        own[2][at] = np.einsum("mti,mi->mt", self.normals, self.places) - self.offsets
-        places = places.copy()
-        places[at] = self.places
-        every = (np.concatenate(pair, axis=1) for pair in zip((normals, offsets, rank), own, strict=True))
-        return *every, places
+
+def pivots(matrices: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Choose pivots of matrices (g, p, q, d), with d components at each node, by elimination, largest part of a row at
+    a node first.
+
+    The coordinates of that node are reflected such that the part has one component. Coordinates without entries are not
+    changed. Returns rows and columns (g, p) of the pivots, how many (g,) there are, and the reflections (g, q, d, d).
+    """
+    (g, p, q, d), left, every = matrices.shape, matrices.copy(), np.arange(len(matrices))
+    rows, columns = np.zeros((2, g, p), dtype=np.int64)
+    count, going, turns = np.zeros(g, dtype=np.int64), np.ones(g, dtype=bool), np.tile(np.eye(d), (g, q, 1, 1))
+    for k in range(p):
+        size = np.sqrt(np.einsum("gpqi,gpqi->gpq", left, left))
+        at, node = np.divmod(size.reshape(g, -1).argmax(axis=1), q)
+        going &= size[every, at, node] > _LEAST
+        if not going.any():
+            break
+        some = np.flatnonzero(going)
+        at, node, each = at[some], node[some], np.arange(len(some))
+        mirror = -left[some, at, node] / size[some, at, node][:, None]
+        slot = np.abs(mirror).argmax(axis=1)
+        mirror[each, slot] += 1.0
+        square = np.einsum("mi,mi->m", mirror, mirror)
+        factor = np.divide(2.0, square, out=np.zeros_like(square), where=square > 0.0)
+        turn = np.eye(d) - factor[:, None, None] * mirror[:, :, None] * mirror[:, None, :]
+        turns[some, node] = turns[some, node] @ turn
+        left[some, :, node] = left[some, :, node] @ turn
+        rows[some, k], columns[some, k] = at, d * node + slot
+        count[some] += 1
+        factors = left[some, :, node, slot] / left[some, at, node, slot][:, None]
+        left[some] -= factors[:, :, None, None] * left[some, at][:, None]
+        left[some, at] = 0.0
+        left[some, :, node, slot] = 0.0
+    return rows, columns, count, turns
+
+
+class RelativeCoordinates:
+    """Coordinates y of nodes in groups of rows that rub, or whose nodes meet walls other than plain planes.
+    Construction is collective.
+
+    y is x, except at the carriers: there it is the sum of weights times positions of a row, in which the row is a wall
+    at that node. The transposed map turns forces: what presses on the relative coordinate acts on all nodes of the row,
+    times their weights. Bounds, sticking and slipping of a row are then those of a node at a plane wall at rest
+    (:mod:`~pfem_petsc.contact.frames`, :mod:`~pfem_petsc.contact.friction`). Rows of several tables over
+    the same nodes share one carrier. A node that a wall stops is no carrier, nor is one whose supports prescribe more
+    components than those of the other nodes of the row. Rows for which no node is left have no carrier.
+
+    Parameters
+    ----------
+    rows : RowSet
+    groups : (groups,) bool, those to which this applies
+    tables : number of tables of rows in the model
+
+    Attributes
+    ----------
+    anywhere : whether there are any on any rank
+    friction, static : (tables,) coefficients of friction
+    carrier : (r,) node of each row among those of the rows, -1 for none
+    nodes, at : (m,) owned carriers, ascending, and a row of each
+    """
+
+    def __init__(self, rows: RowSet, groups: np.ndarray, tables: int) -> None:
+        self.rows, self.groups = rows, groups
+        comm = rows.mesh.comm
+        self.anywhere = bool(comm.allreduce(bool(self.groups.any()), op=MPI.LOR))
+        coefficients = np.zeros((tables, 2))
+        coefficients[rows.source] = rows.friction
+        comm.Allreduce(MPI.IN_PLACE, coefficients, op=MPI.MAX)
+        self.friction, self.static = coefficients.T.copy()
+        # nodes of rows whose supports let them carry the relative coordinate
+        part = (rows.weights != 0.0) & rows.fixed[:, None]
+        free = (rows.free > 0.0)[rows.ends]
+        needed = (free & part[:, :, None]).any(axis=1, keepdims=True)
+        self._may = part & (free | ~needed).all(axis=2) & groups[rows.group_of_row][:, None]
+        # the first row over the same nodes, with whose carrier the first ones of other tables have a slot as well
+        nodes = np.column_stack([rows.ends, rows.weights])
+        _, first, same = np.unique(nodes, axis=0, return_index=True, return_inverse=True)
+        self._first, self._slot = first[same.ravel()], np.zeros(len(rows.source), dtype=bool)
+        self._slot[np.unique(np.column_stack([self._first, rows.source]), axis=0, return_index=True)[1]] = True
+        self._take(np.full(len(rows.source), -1))
+
+    def choose(self, stopped: np.ndarray, x: np.ndarray) -> None:
+        """Choose the carriers for a solve, by elimination. Collective.
+
+        Parameters
+        ----------
+        stopped : (owned,) bool, nodes that walls may stop
+        x : (owned, 3) positions, by which rows are left without a carrier if not all can have one [m]
+        """
+        rows = self.rows
+        every = rows.gather(np.column_stack([stopped, x]))
+        may = self._may & (every[:, 0] == 0.0)[rows.ends] & (self._first == np.arange(len(self._first)))[:, None]
+        carrier, values = np.full(len(rows.source), -1), rows.values(every[:, 1:])
+        for groups in rows.alike_of(self.groups):
+            order = np.argsort(values[groups.rows], axis=1, kind="stable")
+            matrix = groups.dense(np.where(may, rows.weights, 0.0)[groups.rows])
+            matrix /= np.maximum(np.abs(matrix).max(axis=2, keepdims=True), 1e-300)
+            matrix = np.take_along_axis(matrix, order[:, :, None], axis=1)
+            row, column, count, _ = pivots(matrix[:, :, ::-1, None])
+            at, k = np.nonzero(np.arange(row.shape[1]) < count[:, None])
+            carrier[groups.rows[at, order[at, row[at, k]]]] = groups.nodes[at, -1 - column[at, k]]
+        self._take(np.where(self._slot, carrier[self._first], -1))
+
+    def _take(self, carrier: np.ndarray) -> None:
+        rows = self.rows
+        self.carrier = carrier
+        placed = np.flatnonzero(carrier >= 0)
+        local = rows.where[carrier[placed]]
+        own = local >= 0
+        self.nodes, first = np.unique(local[own], return_index=True)
+        self.at = placed[own][first]
+        self._placed = placed[own]
+        self._place = np.searchsorted(self.nodes, local[own])
+        self._inverse = [(groups.nodes, np.linalg.inv(self.weights(groups))) for groups in rows.alike_of(self.groups)]
+
+    def weights(self, groups: Alike) -> np.ndarray:
+        """Return y by x (g, q, q) of groups alike."""
+        weights = np.tile(np.eye(groups.nodes.shape[1]), (len(groups.nodes), 1, 1))
+        group, row = np.nonzero(self.carrier[groups.rows] >= 0)
+        where = groups.nodes[group] == self.carrier[groups.rows[group, row]][:, None]
+        weights[group, where.argmax(axis=1)] = groups.dense(self.rows.weights[groups.rows])[group, row]
+        return weights
+
+    def positions(self, x: np.ndarray) -> np.ndarray:
+        """Return y (owned, 3) of positions x (owned, 3) [m]. Collective."""
+        y = x.copy()
+        y[self.nodes] = self.rows.slips(self.rows.gather(x))[self.at]
+        return y
+
+    def forces(self, g: np.ndarray) -> np.ndarray:
+        """Return the forces (owned, 3) on y of forces g (owned, 3) on x [N]. Collective."""
+        every, g = self.rows.gather(g), g.copy()
+        for nodes, inverse in self._inverse:
+            every[nodes] = np.einsum("gab,gai->gbi", inverse, every[nodes])
+        g[self.rows.here] = every[self.rows.mine]
+        return g
+
+    def stiffness(self, k: np.ndarray) -> np.ndarray:
+        """Return the stiffness (owned,) of y by that of x (owned,) [N/m]: 1/k = sum of w^2/k of the nodes of a row that
+        supports let move. Collective."""
+        rows, total = self.rows, k.copy()
+        soft = np.where(rows.free.any(axis=1), 1.0 / np.maximum(rows.gather(k), 1e-300), 0.0)
+        soft = (rows.weights[self.at] ** 2 * soft[rows.ends[self.at]]).sum(axis=1)
+        total[self.nodes] = np.where(soft > 0.0, 1.0 / np.maximum(soft, 1e-300), k[self.nodes])
+        return total
+
+    def planes(self, x: np.ndarray, nodes: np.ndarray) -> RowPlanes:
+        """Return the rows with carriers at positions (owned, 3) as planes of owned nodes (k,), ascending, which include
+        the carriers. Collective."""
+        rows, every, at, tables = self.rows, self.rows.gather(x), self._placed, len(self.friction)
+        planes = RowPlanes.none(self.positions(x)[nodes], tables)
+        if len(at):
+            place, table = np.searchsorted(nodes, self.nodes)[self._place], rows.source[at]
+            end = np.abs(rows.weights[at]).argmax(axis=1)
+            n = rows.fixed_jacobian[at, end] / rows.weights[at, end][:, None]
+            planes.normals[place, table] = n
+            planes.offsets[place, table] = np.einsum("ri,ri->r", n, rows.slips(every)[at]) - rows.values(every)[at]
+        return planes
 
 
 _FILLED = "basis", "inverse", "lower", "upper", "rows", "ratios", "shared", "bounds"
@@ -209,61 +356,31 @@ def build_frames(nodes: np.ndarray, planes: Planes, tolerance: float = 0.0, leas
     return frames
 
 
-@kernel
-def _rest(vector, spanned, n, out):
-    """Write the part of a unit vector orthogonal to n orthonormal vectors to ``out``; return its length."""
-    for c in range(3):
-        out[c] = vector[c]
+@inlined
+def _rest(part, spanned, n):
+    """Return the part of a unit vector orthogonal to n orthonormal vectors, and its length."""
     for _ in range(2):  # twice is enough for orthogonality to rounding
         for p in range(n):
-            s = 0.0
-            for c in range(3):
-                s += spanned[p, c] * out[c]
-            for c in range(3):
-                out[c] -= s * spanned[p, c]
-    return math.sqrt(out[0] * out[0] + out[1] * out[1] + out[2] * out[2])
+            part = along(part, -dot(part, vector(spanned, p)), vector(spanned, p))
+    return part, math.sqrt(dot(part, part))
 
 
-@kernel
+@inlined
 def _complete(basis, taken, spanned, n):
     """Fill the rows of a basis (3, 3) that are not ``taken``; the first n of ``spanned`` (3, 3) are orthonormal vectors
     of the span of the others."""
-    part, unit, best_part = np.zeros(3), np.zeros(3), np.zeros(3)
     for slot in range(3):
         if taken[slot]:
             continue
         # prefer the axis of the slot, to avoid needless rotations
         best = -1.0
         for shift in range(3):
-            axis = (slot + shift) % 3
-            for c in range(3):
-                unit[c] = 1.0 if c == axis else 0.0
-            length = _rest(unit, spanned, n, part)
+            part, length = _rest(vector(_AXES, (slot + shift) % 3), spanned, n)
             if length > best + 1e-9:
                 best = length
-                for c in range(3):
-                    best_part[c] = part[c] / length
-        for c in range(3):
-            basis[slot, c] = best_part[c]
-            spanned[n, c] = best_part[c]
+                put(basis, slot, times(1.0 / length, part))
+        put(spanned, n, vector(basis, slot))
         n += 1
-
-
-@kernel
-def _invert(b, inverse):
-    """Write the inverse of a basis (3, 3); return whether it is the identity."""
-    for r in range(3):
-        p, q = (r + 1) % 3, (r + 2) % 3
-        for c in range(3):
-            s, t = (c + 1) % 3, (c + 2) % 3
-            inverse[c, r] = b[p, s] * b[q, t] - b[p, t] * b[q, s]
-    determinant = b[0, 0] * inverse[0, 0] + b[0, 1] * inverse[1, 0] + b[0, 2] * inverse[2, 0]
-    plain = True
-    for r in range(3):
-        for c in range(3):
-            inverse[r, c] /= determinant
-            plain = plain and b[r, c] == (1.0 if r == c else 0.0)
-    return plain
 
 
 @kernel
@@ -273,21 +390,15 @@ def _build(planes, tolerance, least, output):
     fixed, normals, offsets, rank, places = planes
     basis, inverse, lower, upper, rows, ratios, shares, bounds = output
     m, w = offsets.shape
-    taken = np.zeros(3, dtype=np.bool_)
-    spanned = np.zeros((3, 3))
-    part = np.zeros(3)
-    done = np.zeros(w, dtype=np.bool_)
-    oblique = False
-    contradiction = -1
+    taken, done, spanned = np.zeros(3, dtype=np.bool_), np.zeros(w, dtype=np.bool_), np.zeros((3, 3))
+    oblique, contradiction = False, -1
     for i in range(m):
-        n = 0
-        volume = 1.0
+        n, volume, own = 0, 1.0, basis[i]
         for c in range(3):
             taken[c] = fixed[i, c]
             if taken[c]:
-                basis[i, c, c] = 1.0
-                spanned[n, 0] = spanned[n, 1] = spanned[n, 2] = 0.0
-                spanned[n, c] = 1.0
+                put(own, c, vector(_AXES, c))
+                put(spanned, n, vector(_AXES, c))
                 n += 1
         for k in range(w):
             done[k] = offsets[i, k] == -math.inf
@@ -299,70 +410,49 @@ def _build(planes, tolerance, least, output):
             if wall < 0:
                 break
             done[wall] = True
-            normal = normals[i, wall]
-            slot, ratio, shared = -1, 1.0, False
+            normal, slot, ratio, shared = vector(normals[i], wall), -1, 1.0, False
+            free = free_components(normal, fixed[i])
             for row in range(3):
                 if taken[row] and not fixed[i, row]:
-                    along, square, free = 0.0, 0.0, 0.0
-                    for c in range(3):
-                        if not fixed[i, c]:
-                            along += basis[i, row, c] * normal[c]
-                            square += basis[i, row, c] ** 2
-                            free += normal[c] ** 2
-                    if free > FREE_PART and abs(along) > (1.0 - _PARALLEL) * math.sqrt(square * free):
-                        slot, ratio, shared = row, along / square, True
+                    other = free_components(vector(own, row), fixed[i])
+                    lengths, common = dot(other, other) * dot(free, free), dot(other, free)
+                    if dot(free, free) > FREE_PART and abs(common) > (1.0 - _PARALLEL) * math.sqrt(lengths):
+                        slot, ratio, shared = row, common / dot(other, other), True
             if not shared:
-                if n == 3:
-                    continue
-                length = _rest(normal, spanned, n, part)
-                if length * volume < least:
+                part, length = _rest(normal, spanned, n)
+                if n == 3 or length * volume < least:
                     continue
                 volume *= length
-                axis = 0
                 for c in range(3):
-                    if abs(normal[c]) > abs(normal[axis]):
-                        axis = c
+                    if not taken[c] and (slot < 0 or abs(normal[c]) > abs(normal[slot])):
+                        slot = c
                 # the length along the axis is not enough: it is 1 to rounding for normals up to 1e-8 off the axis
-                only = max(abs(normal[(axis + 1) % 3]), abs(normal[(axis + 2) % 3])) <= _ALONG
-                if only and not taken[axis]:
-                    slot = axis
-                    ratio = 1.0 if normal[axis] > 0.0 else -1.0
-                    basis[i, slot, axis] = 1.0
+                if max(abs(normal[(slot + 1) % 3]), abs(normal[(slot + 2) % 3])) <= _ALONG:
+                    put(own, slot, vector(_AXES, slot))
+                    ratio = 1.0 if normal[slot] > 0.0 else -1.0
                 else:
-                    for c in range(3):
-                        if not taken[c] and (slot < 0 or abs(normal[c]) > abs(normal[slot])):
-                            slot = c
-                    for c in range(3):
-                        basis[i, slot, c] = normal[c]
-                for c in range(3):
-                    spanned[n, c] = part[c] / length
+                    put(own, slot, normal)
+                put(spanned, n, times(1.0 / length, part))
                 n += 1
                 taken[slot] = True
-            rows[i, wall] = slot
-            ratios[i, wall] = ratio
-            bound = offsets[i, wall] / ratio
-            if shared:
-                here, gap, same = 0.0, -offsets[i, wall], True
-                for c in range(3):
-                    here += basis[i, slot, c] * places[i, c]
-                    gap += normal[c] * places[i, c]
-                    same = same and normal[c] == ratio * basis[i, slot, c]
-                if not same:
-                    bound = here - gap / ratio
-                    shares[i, wall] = True
-            bounds[i, wall] = bound
+            rows[i, wall], ratios[i, wall], bounds[i, wall] = slot, ratio, offsets[i, wall] / ratio
+            turn, place = along(normal, -ratio, vector(own, slot)), vector(places, i)
+            if shared and not turn[0] == turn[1] == turn[2] == 0.0:
+                bounds[i, wall] = dot(vector(own, slot), place) - (dot(normal, place) - offsets[i, wall]) / ratio
+                shares[i, wall] = True
             if ratio > 0.0:
-                lower[i, slot] = max(lower[i, slot], bound)
+                lower[i, slot] = max(lower[i, slot], bounds[i, wall])
             else:
-                upper[i, slot] = min(upper[i, slot], bound)
-        _complete(basis[i], taken, spanned, n)
-        plain = _invert(basis[i], inverse[i])
+                upper[i, slot] = min(upper[i, slot], bounds[i, wall])
+        _complete(own, taken, spanned, n)
+        determinant = dot(vector(own, 0), cross(vector(own, 1), vector(own, 2)))
         for r in range(3):
+            column = cross(vector(own, (r + 1) % 3), vector(own, (r + 2) % 3))
+            put(inverse[i].T, r, times(1.0 / determinant, column))
+            turn = minus(vector(own, r), vector(_AXES, r))
+            oblique = oblique or not turn[0] == turn[1] == turn[2] == 0.0
             if lower[i, r] > upper[i, r]:
                 if lower[i, r] > upper[i, r] + tolerance and contradiction < 0:
                     contradiction = i
-                middle = 0.5 * (lower[i, r] + upper[i, r])
-                lower[i, r] = middle
-                upper[i, r] = middle
-        oblique = oblique or not plain
+                lower[i, r] = upper[i, r] = 0.5 * (lower[i, r] + upper[i, r])
     return oblique, contradiction

@@ -97,8 +97,7 @@ class FreeWalls:
         self.turns = np.tile(np.eye(3), (len(self.turners), 1, 1))
         speeds = np.array([wall.velocity or (0.0, 0.0, 0.0) for wall in mine], dtype=float).reshape(-1, 3)
         spins = np.array([mine[i].angular_velocity or (0.0, 0.0, 0.0) for i in self.turners], dtype=float)
-        momenta = np.einsum("tij,tj->ti", tensors, spins.reshape(-1, 3))
-        v = np.vstack([speeds, momenta / self._scale])
+        v = np.vstack([speeds, np.einsum("tij,tj->ti", tensors, spins.reshape(-1, 3)) / self._scale])
         self.state = State(np.zeros_like(v), v, *(np.zeros_like(v) for _ in range(5)))
         self._balance: Balance | None = None
         self._u = np.zeros_like(v)
@@ -138,6 +137,7 @@ class FreeWalls:
             self.turns = turns_by(self._turn(state.x - before)[0]) @ self.turns
         state.time = time
         self._balance, self._start = self.scheme.balance(state, h), self.turns
+        self._known = 0.0 if self._balance.a_hat is None else self._balance.a_hat
         self._times, self._ends = (time, self._balance.time), (state.x.copy(), state.x)
         self._place()
         self._move(self._u)
@@ -228,8 +228,7 @@ class FreeWalls:
     def unpushed(self) -> tuple[np.ndarray, np.ndarray]:
         """Return displacements (f, 3) [m] and turns (t, 3, 3) at the end of the step being solved, without contact."""
         balance = self._balance
-        known = 0.0 if balance.a_hat is None else balance.a_hat
-        free = balance.predictor + (self._load(balance.acting) / self._masses - known) / balance.alpha
+        free = balance.predictor + (self._load(balance.acting) / self._masses - self._known) / balance.alpha
         return free[: len(self.at)], turns_by(self._turn(free - self._ends[0])[0]) @ self._start
 
     def _wrench(self, force: np.ndarray, moment: np.ndarray) -> np.ndarray:
@@ -297,8 +296,7 @@ class FreeWalls:
         if earlier is not None:
             return self.twists(earlier - self.state.v)
         balance = self._balance
-        known = 0.0 if balance.a_hat is None else balance.a_hat
-        pushed = self._load(balance.acting) / self._masses - (balance.alpha * self._u + known)
+        pushed = self._load(balance.acting) / self._masses - (balance.alpha * self._u + self._known)
         return self.twists(balance.eta / balance.alpha * pushed)
 
     def inertias(self, i: int) -> tuple[np.ndarray, np.ndarray]:
@@ -328,7 +326,7 @@ class FreeWalls:
             forces()
             return True
         balance, masses = self._balance, self._masses
-        inertial = np.zeros_like(masses) if balance.a_hat is None else masses * balance.a_hat
+        inertial = masses * self._known
         weight = np.repeat(balance.alpha * masses, 3)
         u = ((self._load(0.0) - inertial) / (balance.alpha * masses)).ravel()
         matrix, earlier, last = np.diag(weight), None, np.inf

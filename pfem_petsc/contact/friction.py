@@ -11,14 +11,13 @@ from mpi4py import MPI
 
 from ..integrators.base import Balance, State
 from ..tolerances import FREE_PART, ON_BOUND, PROJECTED
-from .frames import NodalFrames, Sliding, SlipForces
+from .frames import NodalFrames, RelativeCoordinates, Sliding, SlipForces
 from .node_walls import free_squares
 from .projection import NodesAtPlanes, Planes, Pressed, pressed
 
 if TYPE_CHECKING:
     from ..mechanics.mass import Inertia
     from .node_walls import NodeWalls
-    from .relative import RelativeCoordinates
 
 
 FAST = 1e16
@@ -92,7 +91,8 @@ _SOFTER, _LEAST = 0.1, 1e-4
 class StepFriction:
     """Friction in one implicit step, at the slots of walls and, behind them, of tables of rows.
 
-    Positions are those of nodes, at carriers of rows relative ones: see :mod:`~pfem_petsc.contact.relative`.
+    Positions are those of nodes, at carriers of rows relative ones, see
+    :class:`~pfem_petsc.contact.frames.RelativeCoordinates`.
 
     Parameters
     ----------
@@ -164,8 +164,7 @@ class StepFriction:
 
     def dissipated(self, nodes: np.ndarray, x: np.ndarray) -> np.ndarray:
         """Return the energy that friction dissipates in each slot, on nodes (m,) of the frames at (m, 3) [J]."""
-        slip = (x - self._start[nodes])[:, None, :] - self._ways(nodes)
-        return -(self.drag * slip).sum(axis=(0, 2))
+        return -(self.drag * ((x - self._start[nodes])[:, None, :] - self._ways(nodes))).sum(axis=(0, 2))
 
     def _ways(self, nodes: np.ndarray) -> np.ndarray:
         """Return how far walls carry nodes (k,) that stick to them in the step, (k, slots, 3) [m]."""
@@ -173,20 +172,18 @@ class StepFriction:
         ways[:, : len(self.contact.wall_of)] = self.contact.ways(self.state.position[nodes], *self._poses)
         return ways
 
-    def apply(self, frames: NodalFrames, x: np.ndarray) -> None:
-        """Fix the sticking nodes of the frames and apply friction to the slipping ones, at a guess (owned, 3)."""
+    def apply(self, frames: NodalFrames) -> None:
+        """Fix the sticking nodes of the frames and apply friction to the slipping ones, at the places of the frames."""
         if not self._rubs:
             return
         nodes = frames.nodes
         has_friction = self._has_friction(frames)
-        fresh = has_friction & ~self._guessed[nodes]
-        if fresh.any():
-            at = np.flatnonzero(fresh)
-            reaction = self._reaction[nodes[at]]
-            none = np.zeros(len(at), dtype=bool)
-            own = self._local(frames, at, x[nodes[at]], reaction, none)
+        at = np.flatnonzero(has_friction & ~self._guessed[nodes])
+        if len(at):
+            x, slipping = frames.places[at], np.zeros(len(at), dtype=bool)
+            own = self._local(frames, at, x, self._reaction[nodes[at]], slipping)
             self._forces[nodes[at]] = own.drag.sum(axis=1)
-            self._decide(frames, at, x[nodes[at]], none, own)
+            self._decide(frames, at, x, slipping, own)
             self._guessed[nodes[at]] = True
         self._hold(frames, np.flatnonzero(has_friction & (self._sticks[nodes] >= 0)))
         moving = has_friction & (self._sticks[nodes] < 0) & (self._directions[nodes] != 0.0).any(axis=(1, 2))
@@ -281,8 +278,7 @@ class StepFriction:
         gaps = np.einsum("mwi,mi->mw", normals, free) - frames.offsets[at]
         static = np.where(slipping[:, None], self._friction, self._static)
         friction = np.stack([np.broadcast_to(self._friction, static.shape), static], axis=-1)
-        slips = (free - self._start[nodes])[:, None, :] - self._ways(nodes)
-        planes = Planes(normals, gaps, friction, slips)
+        planes = Planes(normals, gaps, friction, (free - self._start[nodes])[:, None, :] - self._ways(nodes))
         return pressed(NodesAtPlanes(free, fixed, stiffness, planes), PROJECTED * contact.size)
 
     def _may_stick(
@@ -307,8 +303,7 @@ class StepFriction:
         slip = self._slip(nodes, moved, frames.normals[at])
         size = np.linalg.norm(drag, axis=2)
         # a normal force within rounding neither sticks nor causes friction
-        least = 1e-9 * normal_forces.max(axis=1, initial=0.0)
-        rubbing = (normal_forces > least[:, None]) & (self._static > 0.0)
+        rubbing = (normal_forces > (1e-9 * normal_forces.max(axis=1, initial=0.0))[:, None]) & (self._static > 0.0)
         needed = np.linalg.norm(drag - self._stiffness[nodes, None, None] * slip, axis=2)
         limit = np.where(slipping[:, None], self._friction, self._static) * normal_forces
         slips = rubbing & (needed > (1.0 + 1e-13) * limit)

@@ -139,29 +139,28 @@ def warn_of_gain(case: Case, step: float, across: float = np.inf) -> str:
 def _remedies(time: Time, impact: RodImpact) -> str:
     """Return at most two settings that do not gain energy, closest to the case first."""
     own = time.integrator, tuple(time.scheme.model_dump().values())
-    tries = []
-    for other in ("stick", "scheme"):
-        if other != impact.treatment and not impact.restitution:
-            lumped = other == "stick" and impact.consistent
-            text = f'contact.treatment = "{other}"' + (' and time.mass = "lumped"' if lumped else "")
-            changed = replace(impact, treatment=other, consistent=impact.consistent and not lumped)
-            tries.append((text, *own, changed))
-    if time.integrator == "wilson":
-        tries.append(("time.theta = 2", "wilson", (2.0,), impact))
-    for size in (1.0, 0.2):
-        if impact.step > size:
-            text = f"a time.step of at most {size:g} times the explicit limit"
-            tries.append((text, *own, replace(impact, step=size)))
+    lumped = ' and time.mass = "lumped"' if impact.consistent else ""
     newmark = 'time.integrator = "newmark" with its default parameters'
     defaults = lookup("pfem_petsc.integrators", "newmark", "").Parameters().model_dump()
-    tries.append((newmark, "newmark", tuple(defaults.values()), impact))
-    if impact.restitution:
-        tries.append(('time.integrator = "energy_momentum"', "energy_momentum", (), impact))
-        for less in (0.9, 0.5):
-            if impact.restitution > less:
-                text = f"a restitution of at most {less:g}"
-                tries.append((text, *own, replace(impact, restitution=less)))
-    found = [text for text, *what in tries if impact_gain(*what) <= BOUND and not overshoots(what[0], what[2].step)]
+    stick, scheme = replace(impact, treatment="stick", consistent=False), replace(impact, treatment="scheme")
+    plain, shorter = not impact.restitution, "a time.step of at most {:g} times the explicit limit"
+    tries = [
+        (plain and impact.treatment != "stick", f'contact.treatment = "stick"{lumped}', *own, stick),
+        (plain and impact.treatment != "scheme", 'contact.treatment = "scheme"', *own, scheme),
+        (time.integrator == "wilson", "time.theta = 2", "wilson", (2.0,), impact),
+        *((impact.step > size, shorter.format(size), *own, replace(impact, step=size)) for size in (1.0, 0.2)),
+        (True, newmark, "newmark", tuple(defaults.values()), impact),
+        (not plain, 'time.integrator = "energy_momentum"', "energy_momentum", (), impact),
+        *(
+            (impact.restitution > less, f"a restitution of at most {less:g}", *own, replace(impact, restitution=less))
+            for less in (0.9, 0.5)
+        ),
+    ]
+    found = [
+        text
+        for applies, text, *what in tries
+        if applies and impact_gain(*what) <= BOUND and not overshoots(what[0], what[2].step)
+    ]
     smaller = [text for text in found if text.startswith("a time.step")]
     found = [text for text in found if text not in smaller[1:]]  # of several step sizes keep the largest
     return ", or ".join(found[:2]) if found else newmark

@@ -9,14 +9,18 @@ rank that has most segments there. Points are segments whose ends coincide.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from itertools import product
+from typing import Any, NamedTuple
 
 import numpy as np
 from mpi4py import MPI
 
+from ..columns import STATUS
 from ..mechanics.compiled import inlined, kernel
 from ..mesh.exchange import Router
-from .vectors import along, cross, dot, minus, vector
+from ..mesh.slab import slab_of
+from ..parallel.heap import returning_freed_memory
+from .rotations import along, cross, dot, minus, put, vector
 
 # Limits for each segment: pieces, and comparisons.
 _PIECES, _COMPARISONS = 8.0, 2000.0
@@ -121,132 +125,48 @@ def find_pairs(comm: MPI.Comm, points: Points, own: Segments, skin: float = 0.0,
     return Pairs(np.empty((0, 2), np.int64), np.empty((0, 2, 2), np.int64), np.empty((0, 2)), np.inf)
 
 
-class Regions(NamedTuple):
-    """Cells of space, by which nodes near each other are compared: of each owned node ``of`` (n,); their numbers along
-    the axes ``count`` (3,), and their width [m]."""
-
-    of: np.ndarray
-    count: np.ndarray
-    width: float
-
-
-_REGIONS = 24  # along an axis, at most
-
-
-def make_regions(comm: MPI.Comm, x: np.ndarray, width: float) -> Regions:
-    """Return cells of at least a width [m] around owned nodes at ``x`` (n, 3). Collective."""
-    ends = np.stack([x.max(axis=0, initial=-np.inf), -x.min(axis=0, initial=np.inf)])
-    comm.Allreduce(MPI.IN_PLACE, ends, op=MPI.MAX)
-    width = max(width, float((ends[0] + ends[1]).max()) / _REGIONS)
-    count = ((ends[0] + ends[1]) / width).astype(np.int64) + 1
-    at = np.minimum(((x + ends[1]) / width).astype(np.int64), count - 1)
-    return Regions((at[:, 0] * count[1] + at[:, 1]) * count[2] + at[:, 2], count, width)
-
-
-def largest_change(
-    comm: MPI.Comm,
-    motion: tuple[np.ndarray, np.ndarray],
-    n_nodes: int,
-    reach: float,
-    near: tuple[Regions, float] | None = None,
-) -> float:
+def largest_change(comm: MPI.Comm, motion: tuple[np.ndarray, np.ndarray], n_nodes: int, reach: float) -> float:
     """Return by how much distances up to ``reach`` between any bars may have changed [m]; infinite for positions that
     are not finite. Collective.
 
     An affine map, the fit of all displacements, takes nodes to within r of where they are. With its singular values s,
-    a distance d has become one between s_min d - 2 r and s_max d + 2 r: a body that spins has not changed. Instead of
-    2 r, bars whose ends are in neighbouring regions have what these differ in at most from the map, as long as others
-    are too far from each other to come near.
+    a distance d has become one between s_min d - 2 r and s_max d + 2 r: a body that spins has not changed.
 
     Parameters
     ----------
     motion : positions (owned, 3) before and now [m]
     n_nodes : of all ranks
-    near : regions of the positions before, and the length of the longest bar [m]
     """
-    start, now = (np.asarray(x) for x in motion)
-    means = comm.allreduce(_moments(start, now, np.zeros((2, 3)))[0]).reshape(2, 3) / n_nodes
-    moments = comm.allreduce(_moments(start, now, means)[1:])
+    at, moved = motion[0], motion[1] - motion[0]
+    middle, way = comm.allreduce(np.stack([at.sum(axis=0), moved.sum(axis=0)])) / n_nodes
+    at, moved = at - middle, moved - way
+    moments = comm.allreduce(np.hstack([at.T @ at, at.T @ moved]))
     if not np.isfinite(moments).all():
         return np.inf
     gradient = np.linalg.pinv(moments[:, :3], rcond=1e-9, hermitian=True) @ moments[:, 3:]
-    regions, longest = near or (None, 0.0)
-    most = np.full((int(np.prod(regions.count)) if near else 0, 6), -np.inf)
-    ends = np.full(6, -np.inf)
-    _ranges(start, now, means, gradient, regions.of if near else np.empty(0, np.int64), most, ends)
+    rest = moved - at @ gradient
+    ends = np.stack([rest.max(axis=0, initial=-np.inf), -rest.min(axis=0, initial=np.inf)])
     comm.Allreduce(MPI.IN_PLACE, ends, op=MPI.MAX)
-    square = _farthest(start, now, means, gradient, 0.5 * (ends[:3] - ends[3:]))
-    rest = 2.0 * np.sqrt(comm.allreduce(square, op=MPI.MAX))
+    rest -= 0.5 * (ends[0] - ends[1])
+    square = comm.allreduce(float(np.einsum("ij,ij->i", rest, rest).max(initial=0.0)), op=MPI.MAX)
     stretch = float(np.abs(np.linalg.svd(np.eye(3) + gradient, compute_uv=False) - 1.0).max())
-    if near:
-        comm.Allreduce(MPI.IN_PLACE, most, op=MPI.MAX)
-        beyond = regions.width - 2.0 * longest
-        if rest + stretch * beyond <= beyond - reach:
-            rest = min(rest, _largest_range(most.reshape(*regions.count, 6)))
-    return rest + stretch * reach
-
-
-def _largest_range(most: np.ndarray) -> float:
-    """Return the largest length of the differences of displacements in neighbouring regions, whose largest ones are
-    ``most`` (nx, ny, nz, 6), in positive and in negative directions."""
-    for axis in range(3):
-        padded = np.pad(most, [(1, 1) if k == axis else (0, 0) for k in range(4)], constant_values=-np.inf)
-        n = most.shape[axis]
-        most = np.maximum.reduce([padded.take(range(k, k + n), axis=axis) for k in range(3)])
-    ways = np.maximum(most[..., :3] + most[..., 3:], 0.0)
-    return float(np.sqrt(np.einsum("...i,...i", ways, ways).max(initial=0.0)))
-
-
-@kernel
-def _moments(start, now, means):
-    """Return the sums (4, 6) of the products of 1 and the positions of nodes with their positions and displacements,
-    less ``means`` (2, 3) of these."""
-    moments = np.zeros((4, 6))
-    for i in range(len(start)):
-        at = minus(vector(start, i), means[0])
-        moved = minus(minus(vector(now, i), vector(start, i)), means[1])
-        rows, columns = (1.0, at[0], at[1], at[2]), (at[0], at[1], at[2], moved[0], moved[1], moved[2])
-        for c in range(4):
-            for d in range(6):
-                moments[c, d] += rows[c] * columns[d]
-    return moments
-
-
-@inlined
-def _rest_of(start, now, means, gradient, i):
-    """Return the displacement of a node beyond an affine map."""
-    at, moved = minus(vector(start, i), means[0]), minus(minus(vector(now, i), vector(start, i)), means[1])
-    return minus(moved, (dot(at, gradient[:, 0]), dot(at, gradient[:, 1]), dot(at, gradient[:, 2])))
-
-
-@kernel
-def _ranges(start, now, means, gradient, regions, most, ends):
-    """Write the largest displacements beyond an affine map, in positive and negative directions, of all nodes, ``ends``
-    (6,), and of the regions, ``most`` (k, 6)."""
-    for i in range(len(start)):
-        rest = _rest_of(start, now, means, gradient, i)
-        for c in range(3):
-            ends[c], ends[3 + c] = max(ends[c], rest[c]), max(ends[3 + c], -rest[c])
-            if len(regions) > 0:
-                k = regions[i]
-                most[k, c], most[k, 3 + c] = max(most[k, c], rest[c]), max(most[k, 3 + c], -rest[c])
-
-
-@kernel
-def _farthest(start, now, means, gradient, centre):
-    """Return the square of the largest distance of displacements beyond an affine map from a ``centre`` (3,)."""
-    farthest = 0.0
-    for i in range(len(start)):
-        rest = minus(_rest_of(start, now, means, gradient, i), centre)
-        farthest = max(farthest, dot(rest, rest))
-    return farthest
+    return 2.0 * np.sqrt(square) + stretch * reach
 
 
 def _measure(
     comm: MPI.Comm, at: np.ndarray, own: Segments, longest: float, skin: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return extremes (9,) and sums (3,) of all segments, see :func:`_measure_segments`. Collective."""
-    most, sums = _measure_segments(at, own, longest, skin)
+    """Return the largest coordinates, with the negative sign and without, and how far pieces with their margins reach
+    from their middles along x, y and z (9,); and the numbers of segments longer than zero, the sum of their lengths
+    with margins, and the number of pieces (3,), of all ranks. Collective."""
+    ends, margin = at[own.points], own.margin + 0.5 * skin
+    way = ends[:, 1] - ends[:, 0]
+    length = np.sqrt(np.einsum("ni,ni->n", way, way))
+    # never more than those of loops, which round otherwise: then cells would be too small
+    pieces = np.floor((1.0 - 1e-9) * length / np.maximum(longest, 4.0 * margin)) + 1.0
+    reach = 0.5 * np.abs(way) / pieces[:, None] + margin[:, None]
+    most = np.stack([-ends.min(axis=1), ends.max(axis=1), reach]).max(axis=1, initial=-np.inf).ravel()
+    sums = np.array([np.count_nonzero(length), (length + 2.0 * own.margin).sum(), pieces.sum()])
     comm.Allreduce(MPI.IN_PLACE, most, op=MPI.MAX)
     comm.Allreduce(MPI.IN_PLACE, sums, op=MPI.SUM)
     return most, sums
@@ -255,12 +175,14 @@ def _measure(
 def _hold(comm: MPI.Comm, grid: _Grid, points: Points, own: Segments) -> tuple[Points, Segments]:
     """Give blocks to ranks, and send segments to those of their cells and of the neighbouring ones; return those that
     this rank has then. Collective."""
-    votes = np.zeros(_BLOCKS, np.int64)
-    _count_blocks(points.at, own, grid, votes)
-    votes = votes * comm.size + (np.arange(_BLOCKS) + comm.rank) % comm.size  # of equal ones, by turns
+    rows, _, cells = _list_pieces(points.at, own, grid)
+    votes = np.bincount(_block(cells), minlength=_BLOCKS) * comm.size
+    votes += (np.arange(_BLOCKS) + comm.rank) % comm.size  # of equal ones, by turns
     comm.Allreduce(MPI.IN_PLACE, votes, op=MPI.MAX)
     grid.owners[:] = (votes - np.arange(_BLOCKS)) % comm.size
-    router = Router(comm, *_list_ranks(points.at, own, grid, comm.size))
+    ranks = [grid.owners[_block(np.maximum(cells + shift, 0))] for shift in product((-1, 1), repeat=3)]
+    rank, row = np.divmod(np.unique(np.stack(ranks) * len(own.ids) + rows), max(len(own.ids), 1))
+    router = Router(comm, rank, row)
     ends = router.send(points.at[own.points])
     before = router.send(points.before[own.points]) if len(points.before) else points.before
     names = router.send(points.names[own.points])
@@ -296,7 +218,14 @@ def _compare(grid: _Grid, points: Points, held: Segments, most: float) -> tuple[
     marks = points.names
     if int(marks.max(initial=0)) > np.iinfo(np.int32).max:
         marks = np.unique(marks, return_inverse=True)[1]
-    pieces = _sort_pieces(points.at, held, grid, folded, marks.astype(np.int32))
+    rows, parts, cells = _list_pieces(points.at, held, grid)
+    x, y, z = (cells % folded).T
+    places = (x * folded[1] + y) * folded[2] + z
+    order = np.argsort(places, kind="stable")
+    starts = np.append(0, np.cumsum(np.bincount(places, minlength=folded.prod())))
+    rows, parts, here = rows[order], parts[order], (grid.owners[_block(cells)] == grid.rank)[order]
+    boxes = _box_pieces(points.at, held, grid, rows, parts, marks.astype(np.int32))
+    pieces = _Pieces(starts.astype(np.int32), rows, parts, *boxes, here)
     rows, at, gap, comparisons = _compare_rows(pieces, points, held, grid, folded, most)
     ids = held.ids[rows].astype(np.int64)
     return Pairs(ids, points.names[held.points[rows]].astype(np.int64), at, gap), comparisons
@@ -312,28 +241,6 @@ def _pieces(at, segments, n, longest, skin):
     return first, way, margin, 1 if square <= most * most else int(np.sqrt(square) / most) + 1
 
 
-@kernel
-def _measure_segments(at, segments, longest, skin):
-    """Return the largest coordinates, with the negative sign and without, and how far pieces with their margins reach
-    from their middles along x, y and z (9,); and the numbers of segments longer than zero, the sum of their lengths
-    with margins, and the number of pieces (3,)."""
-    most, sums = np.full(9, -np.inf), np.zeros(3)
-    number = total = every = 0.0
-    for n in range(len(segments.ids)):
-        first, way, margin, pieces = _pieces(at, segments, n, longest, skin)
-        part, square = 0.5 / pieces, dot(way, way)
-        for c in range(3):
-            last = first[c] + way[c]
-            most[c] = max(most[c], -first[c], -last)
-            most[3 + c] = max(most[3 + c], first[c], last)
-            most[6 + c] = max(most[6 + c], part * abs(way[c]) + margin)
-        number += square > 0.0
-        total += np.sqrt(square) + 2.0 * segments.margin[n]
-        every += pieces
-    sums[0], sums[1], sums[2] = number, total, every
-    return most, sums
-
-
 @inlined
 def _cell(first, way, part, pieces, grid):
     """Return the numbers of the cell of the middle of a piece along the axes. They grow with the coordinates, by no
@@ -344,42 +251,28 @@ def _cell(first, way, part, pieces, grid):
     return i, j, int(min(max(z * grid.inverse[2], 0.0), grid.count[2] - 1.0))
 
 
-@inlined
-def _block(i, j, k):
-    """Return the number of a block of cells."""
-    key = np.uint64(((i << 42) | (j << 21) | k) + 1)
-    return np.int64((key * np.uint64(0x9E3779B97F4A7C15)) >> np.uint64(33)) % _BLOCKS
-
-
 @kernel
-def _count_blocks(at, segments, grid, votes):
-    """Count the pieces in each block."""
+def _list_pieces(at, segments, grid):
+    """Return the rows of the segments of all pieces (m,) int32, their numbers among those of the segment (m,) int32,
+    and the cells (m, 3) of their middles."""
+    count = 0
+    for n in range(len(segments.ids)):
+        count += _pieces(at, segments, n, grid.longest, grid.skin)[3]
+    rows, parts, cells, m = np.empty(count, np.int32), np.empty(count, np.int32), np.empty((count, 3), np.int64), 0
     for n in range(len(segments.ids)):
         first, way, _, pieces = _pieces(at, segments, n, grid.longest, grid.skin)
         for part in range(pieces):
-            i, j, k = _cell(first, way, part, pieces, grid)
-            votes[_block(i // _BLOCK, j // _BLOCK, k // _BLOCK)] += 1
+            rows[m], parts[m] = n, part
+            put(cells, m, _cell(first, way, part, pieces, grid))
+            m += 1
+    return rows, parts, cells
 
 
-@kernel
-def _list_ranks(at, segments, grid, size):
-    """Return the ranks to which each segment goes, and its row, for each."""
-    seen, count = np.full(size, -1, np.int64), 0
-    ranks, rows = np.empty(_ROOM, np.int64), np.empty(_ROOM, np.int64)
-    for n in range(len(segments.ids)):
-        first, way, _, pieces = _pieces(at, segments, n, grid.longest, grid.skin)
-        if count + size > len(rows):
-            ranks, rows = _longer(ranks, size), _longer(rows, size)
-        for part in range(pieces):
-            x, y, z = _cell(first, way, part, pieces, grid)
-            for i in range(max(x - 1, 0) // _BLOCK, (x + 1) // _BLOCK + 1):
-                for j in range(max(y - 1, 0) // _BLOCK, (y + 1) // _BLOCK + 1):
-                    for k in range(max(z - 1, 0) // _BLOCK, (z + 1) // _BLOCK + 1):
-                        owner = grid.owners[_block(i, j, k)]
-                        if seen[owner] < n:
-                            seen[owner], ranks[count], rows[count] = n, owner, n
-                            count += 1
-    return ranks[:count], rows[:count]
+def _block(cells: np.ndarray) -> np.ndarray:
+    """Return the numbers of the blocks of cells (..., 3)."""
+    i, j, k = np.moveaxis(cells // _BLOCK, -1, 0).astype(np.uint64)
+    key = ((i << np.uint64(42)) | (j << np.uint64(21)) | k) + np.uint64(1)
+    return ((key * np.uint64(0x9E3779B97F4A7C15)) >> np.uint64(33)).astype(np.int64) % _BLOCKS
 
 
 @inlined
@@ -390,49 +283,23 @@ def _longer(array, more):
     return copy
 
 
-@inlined
-def _fold(i, count):
-    """Return the place of a cell along an axis with some places; divisions are slow."""
-    return i if i < count else i % count
-
-
 @kernel
-def _sort_pieces(at, segments, grid, folded, marks):
-    """Return the pieces of segments, sorted by cells; ``folded`` (3,): places of cells along the axes; ``marks`` (p,)
-    int32 of points, equal where their names are."""
-    starts, most = np.zeros(folded[0] * folded[1] * folded[2] + 2, np.int32), 0
-    for n in range(len(segments.ids)):
-        most += _pieces(at, segments, n, grid.longest, grid.skin)[3]
-    cells, here, unit, m = np.empty(most, np.int32), np.empty(most, np.bool_), grid.unit, 0
-    for n in range(len(segments.ids)):
-        first, way, _, pieces = _pieces(at, segments, n, grid.longest, grid.skin)
-        for part in range(pieces):
-            i, j, k = _cell(first, way, part, pieces, grid)
-            cells[m] = (_fold(i, folded[0]) * folded[1] + _fold(j, folded[1])) * folded[2] + _fold(k, folded[2])
-            starts[cells[m] + 2] += 1
-            m += 1
-    for cell in range(len(starts) - 1):
-        starts[cell + 1] += starts[cell]
-    rows, parts, m = np.empty(most, np.int32), np.empty(most, np.int32), 0
+def _box_pieces(at, segments, grid, rows, parts, marks):
+    """Return the boxes (m, 6), ways (m, 4) and ends (m, 2) of :class:`_Pieces`; ``marks`` (p,) int32 of points, equal
+    where their names are."""
+    most, unit = len(rows), grid.unit
     boxes, ways, ends = np.empty((most, 6), np.float32), np.empty((most, 4), np.float32), np.empty((most, 2), np.int32)
-    for n in range(len(segments.ids)):
-        first, way, margin, pieces = _pieces(at, segments, n, grid.longest, grid.skin)
-        for part in range(pieces):
-            place = starts[cells[m] + 1]
-            starts[cells[m] + 1] += 1
-            m += 1
-            i, j, k = _cell(first, way, part, pieces, grid)
-            here[place] = grid.owners[_block(i // _BLOCK, j // _BLOCK, k // _BLOCK)] == grid.rank
-            rows[place], parts[place] = n, part
-            ends[place, 0], ends[place, 1] = marks[segments.points[n, 0]], marks[segments.points[n, 1]]
-            middle, slack = minus(along(first, (part + 0.5) / pieces, way), grid.low), 0.0
-            for c in range(3):  # in single precision, boxes are rounded outwards
-                slack = max(slack, 2e-7 * ((abs(middle[c]) + abs(way[c])) / unit + 1.0))
-            ways[place, 3] = margin / unit + slack
-            for c in range(3):
-                boxes[place, c], ways[place, c] = middle[c] / unit, way[c] / pieces / unit
-                boxes[place, 3 + c] = _HALF * abs(ways[place, c]) + ways[place, 3]
-    return _Pieces(starts[:-1], rows, parts, boxes, ways, ends, here)
+    for m in range(most):
+        first, way, margin, pieces = _pieces(at, segments, rows[m], grid.longest, grid.skin)
+        ends[m, 0], ends[m, 1] = marks[segments.points[rows[m], 0]], marks[segments.points[rows[m], 1]]
+        middle, slack = minus(along(first, (parts[m] + 0.5) / pieces, way), grid.low), 0.0
+        for c in range(3):  # in single precision, boxes are rounded outwards
+            slack = max(slack, 2e-7 * ((abs(middle[c]) + abs(way[c])) / unit + 1.0))
+        ways[m, 3] = margin / unit + slack
+        for c in range(3):
+            boxes[m, c], ways[m, c] = middle[c] / unit, way[c] / pieces / unit
+            boxes[m, 3 + c] = _HALF * abs(ways[m, c]) + ways[m, 3]
+    return boxes, ways, ends
 
 
 @inlined
@@ -624,3 +491,114 @@ def _compare_rows(pieces, points, held, grid, folded, most):
                         rows[found, 0], rows[found, 1], at[found, 0], at[found, 1] = one, two, s, t
                         found += 1
     return rows[:found], at[:found], gap, comparisons
+
+
+STOUT = 0.25
+"""Radius of a bar over its length beyond which it has no axis that others could cross."""
+
+# Bars this much closer to each other in the mesh, relative to their radii, touch there: it may be rounding.
+_NEAR = 0.01
+
+# Distance between bars up to which the search knows it, over their mean length. No search is needed before it has
+# changed.
+_SKIN = 0.1
+
+# Coordinate beyond which a node is not searched [m].
+_STRAY = 1e100
+
+
+class Crossing(NamedTuple):
+    """Pairs of bars that pass through each other, number of bars among them, and the lowest pair of numbers."""
+
+    pairs: int
+    bars: int
+    lowest: tuple[int, int]
+
+
+class CrossingBars:
+    """Finds bars that pass through each other and did not in the mesh. Collective, with results for any ranks alike.
+
+    Bars with an end in contact pairs or constraints may meet, by which others of this kind come close: such pairs are
+    left out, and so are springs, dashpots, broken bars, and bars that are less than twice as long as thick.
+
+    Attributes
+    ----------
+    applicable : whether there are bars to be searched
+    """
+
+    def __init__(self, model: Any) -> None:
+        self._model = model
+        mesh = model.mesh
+        self._n_bars = mesh.n_bars - mesh.n_connectors
+        radius = model.bars.radii()[mesh.counted]
+        slender = radius < STOUT * model.bars.mesh_lengths[mesh.counted]
+        slender &= mesh.bar_ids[mesh.counted] < self._n_bars
+        self._bars = mesh.counted
+        if not (isinstance(self._bars, slice) and slender.all()):
+            self._bars = np.arange(len(mesh.bars), dtype=np.int32)[self._bars][slender]
+        self.applicable = model.comm.allreduce(int(np.count_nonzero(slender))) > 1 and model.self_contact is None
+        self._thick = 2.0 * model.comm.allreduce(float(radius[slender].max(initial=0.0)), op=MPI.MAX)
+        self._kind = self._linked_bars()
+        # the last search: its result, the smallest distance at which that would change [m], positions, and bars
+        self._found: Crossing | None = Crossing(0, 0, (-1, -1))  # in the mesh, no bar does
+        self._gap, self._before, self._were = 0.0, mesh.points, None
+
+    def _linked_bars(self) -> np.ndarray:
+        """Return (bars,) uint8: 1 for those with an end in contact pairs or constraints, else 0; (0,) without any.
+        Collective."""
+        case, mesh = self._model.case, self._model.mesh
+        tables = (*case.contact_pair, *case.constraint)
+        if not tables:
+            return np.empty(0, np.uint8)
+        linked = np.zeros((mesh.n_local, 1))
+        for table in tables:
+            for value in table.model_dump().values():
+                for name in value if isinstance(value, list | tuple) else [value]:
+                    if isinstance(name, str) and name in self._model.nodes:
+                        linked[self._model.nodes[name]] = 1.0
+        mesh.update_ghosts(linked)
+        return (linked[mesh.bars[self._bars], 0] > 0.0).any(axis=1).astype(np.uint8)
+
+    def find(self, x: np.ndarray) -> Crossing | None:
+        """Return the bars at positions (local, 3) [m] that pass through each other; None if the search would take too
+        long, because too many bars are in one place."""
+        comm, mesh, intact = self._model.comm, self._model.mesh, self._intact()
+        self._were = intact if self._were is None else self._were
+        motion = self._before[: mesh.n_owned], x[: mesh.n_owned]
+        change = largest_change(comm, motion, mesh.n_nodes, self._thick + self._gap)
+        if comm.allreduce(bool((intact != self._were).any()), op=MPI.LOR):
+            change = np.inf
+        if change > 0.0 and change >= 0.998 * self._gap:
+            with returning_freed_memory():
+                self._found, self._gap = self._search(x)
+            self._before, self._were = x.copy(), intact
+        return self._found
+
+    def _intact(self) -> np.ndarray:
+        """Return (bars,) bool: those that are not broken; (0,) if none can break."""
+        if not self._model.bars.can_break:
+            return np.empty(0, dtype=bool)
+        return self._model.bars.status()[self._bars] != STATUS.index("broken")
+
+    def _count(self, pairs: np.ndarray) -> Crossing:
+        """Return the number of pairs and bars from the pairs (m, 2) that this rank has found. Collective."""
+        comm, n = self._model.comm, self._n_bars
+        both = np.unique(pairs)
+        bars = np.unique(Router(comm, slab_of(both, n, comm.size)).send(both))
+        lowest = int((pairs[:, 0] * n + pairs[:, 1]).min(initial=np.iinfo(np.int64).max))
+        lowest = comm.allreduce(lowest, op=MPI.MIN)
+        return Crossing(comm.allreduce(len(pairs)), comm.allreduce(len(bars)), (lowest // n, lowest % n))
+
+    def _search(self, x: np.ndarray) -> tuple[Crossing | None, float]:
+        """Return the pairs at positions (local, 3) [m], and by how much the distance of any two bars differs at least
+        from the sum of their radii [m]."""
+        comm, mesh, bars = self._model.comm, self._model.mesh, self._model.bars
+        ids, ends, radius, kind = mesh.bar_ids[self._bars], mesh.bars[self._bars], bars.radii()[self._bars], self._kind
+        # stray nodes may be anywhere, and squares of distances must be finite; a NaN has its own message elsewhere
+        near = (np.abs(x) < _STRAY).all(axis=1)
+        if bars.can_break or not near.all():
+            kept = near[ends].all(axis=1) & (self._intact() if bars.can_break else True)
+            ids, ends, radius, kind = ids[kept], ends[kept], radius[kept], kind[kept] if len(kind) else kind
+        segments = Segments(ids, ends, radius, kind)
+        found = find_pairs(comm, Points(x, mesh.node_ids, mesh.points), segments, _SKIN, 1.0 + _NEAR)
+        return (None, 0.0) if found is None else (self._count(found.ids), found.gap)

@@ -7,7 +7,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, ClassVar, Self
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 from mpi4py import MPI
@@ -16,7 +16,7 @@ from ..mechanics.compiled import kernel
 from ..parallel.agreement import agreed
 from ..tolerances import BEYOND, FREE_PART, resolvable
 from .surfaces import Surfaces
-from .touched_faces import TouchedFaces
+from .triangles import TouchedFaces
 from .wall_motion import Poses, WallMotion
 from .walls.base import made_wall
 
@@ -51,21 +51,6 @@ class WallForces:
     touching: np.ndarray
     places: np.ndarray
     friction: float = 0.0
-
-    @classmethod
-    def none(cls, walls: int, slots: int) -> Self:
-        """Return zero forces, shared by all steps without contact; the sums are read-only."""
-        none = cls(
-            np.zeros((walls, 3)),
-            np.zeros(walls, dtype=np.int64),
-            np.zeros((walls, 3)),
-            np.empty(0, dtype=np.int64),
-            np.empty((0, slots), dtype=bool),
-            np.empty((0, 3)),
-        )
-        for name in none.sums:
-            getattr(none, name).flags.writeable = False
-        return none
 
 
 def free_squares(fixed: np.ndarray, normals: np.ndarray) -> np.ndarray:
@@ -172,8 +157,6 @@ class ContactLog:
         ``contacts`` (walls,): number of nodes of all ranks in contact after the last step, if known.
         """
         n, self.noted = self.noted, 0
-        if not len(self.time):
-            return np.empty((n + 1, 0))
         flags = self._flags[:n]
         if n == 1 and contacts is not None:
             flags[0] = contacts > 0
@@ -211,37 +194,6 @@ class ContactLog:
         self.last = np.flatnonzero(touching.any(axis=1))
 
 
-@kernel
-def near_planes(x, normals, offsets, all_nodes, members, reach, near):
-    """Mark nodes within reach of a plane.
-
-    Parameters
-    ----------
-    x : (n, 3) positions [m]
-    normals : (w, 3); offsets : (w,) [m]: planes n . x = d
-    all_nodes : (w,) bool, whether a plane applies to all nodes
-    members : (n, w) bool, nodes to which a plane applies otherwise
-    reach : (n,) or (1,) distance below which a node counts as near [m]
-    near : (n,) bool, updated
-
-    Returns
-    -------
-    int
-        Number of nodes marked here.
-    """
-    count = 0
-    per_node = len(reach) > 1
-    for i in range(len(x)):
-        limit = reach[i] if per_node else reach[0]
-        for k in range(len(offsets)):
-            gap = normals[k, 0] * x[i, 0] + normals[k, 1] * x[i, 1] + normals[k, 2] * x[i, 2] - offsets[k]
-            if gap < limit and (all_nodes[k] or members[i, k]):
-                near[i] = True
-                count += 1
-                break
-    return count
-
-
 _ZERO, _ALL = np.zeros(1), slice(None)
 TURN = 0.8
 """Cosine between normals in a step, below which forces act along that at the new position."""
@@ -258,7 +210,7 @@ class NodeWalls:
     moving : (walls,) bool
     wall_of, first : (slots,) and (walls,): the wall of each slot, and the first slot of each wall
     members : (owned, slots) bool, nodes that a wall can stop
-    flat : (slots,) bool, planes that never turn; normals : (slots, 3) of these, zero for the others
+    flat : (slots,) bool, planes that never turn
     surfaces : Surfaces of the walls at rest
     centres : (walls, 3) points at rest whose positions are recorded, of walls with inertia the centres of mass [m]
     log : ContactLog
@@ -277,10 +229,8 @@ class NodeWalls:
         parameters: Sequence[WallKeys] | None = None,
     ) -> None:
         walls = list(case.wall) if parameters is None else parameters
-        self.source = case.source
-        self.mesh = mesh
-        self.fixed = fixed
-        self.state = None
+        self.source, self.state = case.source, None
+        self.mesh, self.fixed = mesh, fixed
         self.names = [wall.name for wall in walls]
         self.any = bool(walls)
         with agreed(mesh.comm):
@@ -294,26 +244,20 @@ class NodeWalls:
         self.wall_of, self.first = np.repeat(np.arange(len(walls)), faces), np.cumsum(faces) - faces
         self.all_nodes = np.array([wall.node_set is None for wall in walls], dtype=bool)[self.wall_of]
         self.members = np.ones((mesh.n_owned, len(self.wall_of)), dtype=bool)
-        for s, k in enumerate(self.wall_of):
-            if walls[k].node_set is not None:
-                self.members[:, s] = False
-                self.members[nodes[walls[k].node_set], s] = True
+        for s in np.flatnonzero(~self.all_nodes):
+            self.members[:, s] = False
+            self.members[nodes[walls[self.wall_of[s]].node_set], s] = True
         self.log = ContactLog(mesh.n_owned, len(walls), self.wall_of)
         friction = np.array([wall.friction_coefficients for wall in walls], dtype=np.float64).reshape(-1, 2)
         self.friction, self.static_friction = np.ascontiguousarray(friction[self.wall_of].T)
         self.restitution = np.array([wall.restitution for wall in walls], dtype=np.float64)[self.wall_of]
         self.rebounds = False
         self.has_friction = bool(self.static_friction.any())
-        flat = np.array([wall.flat for wall in self.walls], dtype=bool) & ~self.motion.turning
-        self.flat = flat[self.wall_of]
+        self.flat = (np.array([wall.flat for wall in self.walls], dtype=bool) & ~self.motion.turning)[self.wall_of]
         self.surfaces = Surfaces.of([self.walls[k] for k in self.wall_of], self.motion.turning[self.wall_of])
         self.partial = any(wall.partial for wall in self.walls)
-        self.normals = np.zeros((len(self.wall_of), 3))
-        self._offsets = np.zeros(len(self.wall_of))
-        for s in np.flatnonzero(self.flat):
-            wall = self.walls[self.wall_of[s]]
-            self.normals[s], self._offsets[s] = wall.normal, wall.offset
-        self._faces = {k: TouchedFaces(wall, mesh.n_owned) for k, wall in enumerate(self.walls) if wall.faces > 1}
+        surfaces = ((k, wall) for k, wall in enumerate(self.walls) if wall.faces > 1)
+        self._faces = {k: TouchedFaces(wall.compiled, wall.planes, mesh.n_owned) for k, wall in surfaces}
         ends = np.stack([-mesh.points.min(axis=0, initial=np.inf), mesh.points.max(axis=0, initial=-np.inf)])
         mesh.comm.Allreduce(MPI.IN_PLACE, ends, op=MPI.MAX)
         coordinates = float(np.abs(ends).max()), float(np.abs(self.centres).max(initial=0.0))
@@ -321,17 +265,20 @@ class NodeWalls:
 
     @cached_property
     def nothing(self) -> WallForces:
-        """Zero contact forces; read-only."""
-        return WallForces.none(len(self.walls), len(self.wall_of))
+        """Zero contact forces, shared by all steps without contact; the sums are read-only."""
+        vectors, nobody, slots = np.zeros((len(self.walls), 3)), np.empty(0, dtype=np.int64), len(self.wall_of)
+        sums = vectors, np.zeros(len(self.walls), dtype=np.int64), vectors
+        for array in sums:
+            array.flags.writeable = False
+        return WallForces(*sums, nobody, np.empty((0, slots), dtype=bool), np.empty((0, 3)))
 
     def of_walls(self, sums: np.ndarray) -> np.ndarray:
         """Return sums over the slots of each wall (walls, ...) from those of slots (slots, ...)."""
-        return np.add.reduceat(sums, self.first, axis=0) if len(self.first) < len(sums) else sums
+        return np.add.reduceat(sums, self.first, axis=0)
 
     def positions(self, time: float) -> np.ndarray:
         """Return the positions of the walls' centres, of mass for walls with inertia (walls, 3) [m]."""
-        poses = self.motion.poses(time)
-        return poses.carried(np.arange(len(self.walls)), self.centres)
+        return self.motion.poses(time).carried(np.arange(len(self.walls)), self.centres)
 
     def velocities(self, time: float) -> np.ndarray:
         """Return the velocities of the walls' centres (walls, 3) [m/s]."""
@@ -353,11 +300,9 @@ class NodeWalls:
         """
         members = self.members if nodes is None else self.members[nodes]
         poses = self.motion.poses(time)
-        gaps = np.full((len(x), len(self.walls)), np.inf)
+        gaps = np.empty((len(x), len(self.walls)))
         for k, s in enumerate(self.first):
-            gaps[:, k] = self.gap(k, x, poses)
-            if not self.all_nodes[s]:
-                gaps[~members[:, s], k] = np.inf
+            gaps[:, k] = np.where(members[:, s], self.gap(k, x, poses), np.inf)
         return gaps
 
     def gap(self, k: int, x: np.ndarray, poses: Poses) -> np.ndarray:
@@ -372,36 +317,33 @@ class NodeWalls:
 
         With a reach of zero these are the nodes beyond a wall.
         """
-        near, every = np.zeros(len(x), dtype=bool), self.members[nodes]
-        if self.flat.any():
-            at = self.flat
-            offsets = self._offsets[at] + np.einsum("ij,ij->i", self.normals[at], poses.shifts[self.wall_of[at]])
-            members = every if self.flat.all() else np.ascontiguousarray(every[:, at])
-            near_planes(x, self.normals[at], offsets, self.all_nodes[at], members, reach, near)
+        near, members = np.zeros(len(x), dtype=bool), self.members[nodes]
         if self._faces:
             start, earlier, slack = self._starts(nodes, x, poses)
         for k, s in enumerate(self.first):
             if k in self._faces:
-                ways = earlier.rest(k, start), poses.rest(k, x)
-                near |= self._faces[k].near(*ways, reach, slack) & every[:, s]
-            elif not self.flat[s]:
-                near |= (self.gap(k, x, poses) < reach) & every[:, s]
+                close = self._faces[k].near(earlier.rest(k, start), poses.rest(k, x), reach, slack)
+            else:
+                close = self.gap(k, x, poses) < reach
+            near |= close & members[:, s]
         return near
 
     def applicable(self, nodes: np.ndarray, x: np.ndarray, poses: Poses) -> np.ndarray:
         """Return (m, slots) bool: walls that can stop nodes that move to positions (m, 3)."""
         applicable = self.members[nodes]
         if self.partial and self.state is not None:
-            state = self.state
-            before = state.position[nodes]
-            earlier = self.motion.poses(state.time)
+            before, earlier, _ = self._starts(nodes, x, poses)
             for k, wall in enumerate(self.walls):
                 if wall.partial:
                     # a node in contact may lie beyond the wall, because the balance need not hold at its position
-                    held = state.contact[nodes] @ earlier.turned(k, wall.normal) > 0.0
+                    held = self.state.contact[nodes] @ earlier.turned(k, wall.normal) > 0.0
                     slack = np.where(held, 0.1 * wall.half.min(), BEYOND * self.size)
                     applicable[:, self.first[k]] &= wall.stops(earlier.rest(k, before), poses.rest(k, x), slack)
         return applicable
+
+    def slots(self, k: int) -> slice:
+        """Return the slots of wall k."""
+        return slice(self.first[k], self.first[k] + self.walls[k].faces)
 
     @property
     def surfaces_of_triangles(self) -> list[int]:
@@ -431,7 +373,7 @@ class NodeWalls:
             memory = {} if self.state is None else self.state.memory
             if (name := f"faces_{k}") not in memory:
                 memory[name] = np.zeros((self.mesh.n_owned, 9))
-            slots = slice(self.first[k], self.first[k] + 3)
+            slots = self.slots(k)
             occupied = self.log.touching[nodes[mine], slots] | self.log.closed[nodes[mine], slots]
             found |= faces.find(nodes[mine], ways, tolerance, (memory[name], occupied))
         return found
@@ -467,26 +409,21 @@ class NodeWalls:
         normals = np.zeros((len(x), len(self.wall_of), 3))
         offsets = np.full((len(x), len(self.wall_of)), -np.inf)
         for k, wall in enumerate(self.walls):
-            s = self.first[k]
-            if k in self._faces:
-                own, distances = self._faces[k].planes(nodes, poses.rest(k, x))
-                last = s + wall.faces
-                normals[:, s:last] = poses.turned(k, own)
-                if acting is not None and self.motion.turning[k]:
-                    normals[:, s:last] = acting[:, s:last]
-                along = np.einsum("mwi,mi->mw", normals[:, s:last], x)
-                offsets[:, s:last] = np.where(np.isfinite(distances), along - distances, -np.inf)
-                continue
-            rest = poses.rest(k, x)
-            own, offsets[:, s] = wall.planes(rest)
-            normals[:, s] = poses.turned(k, own)
+            s, rest, slots = self.first[k], poses.rest(k, x), self.slots(k)
             if self.flat[s]:
+                normals[:, s], offsets[:, s] = wall.planes(rest)
+                normals[:, s] = poses.turned(k, normals[:, s])
                 offsets[:, s] += normals[:, s] @ poses.shifts[k]
                 continue
+            if k in self._faces:
+                own, distances = self._faces[k].planes(nodes, rest)
+            else:
+                own, distances = wall.planes(rest)[0][:, None], wall.gaps(rest)[:, None]
+            normals[:, slots] = poses.turned(k, own)
             if acting is not None:
-                other = acting[:, s].any(axis=1)
-                normals[other, s] = acting[other, s]
-            offsets[:, s] = np.einsum("mi,mi->m", normals[:, s], x) - wall.gaps(rest)
+                np.copyto(normals[:, slots], acting[:, slots], where=acting[:, slots].any(axis=2, keepdims=True))
+            along = np.einsum("mwi,mi->mw", normals[:, slots], x)
+            offsets[:, slots] = np.where(np.isfinite(distances), along - distances, -np.inf)
         offsets[~applicable] = -np.inf
         return normals, offsets
 
@@ -542,14 +479,12 @@ class NodeWalls:
         for k, s in enumerate(self.first):
             if k in self._faces:  # faces are flat: their normals are those of where the body is there
                 own, _ = self._faces[k].planes(nodes, poses.rest(k, x))
-                acting[:, s : s + self.walls[k].faces] = between.turned(k, own)
-            if self.flat[s] or k in self._faces:
-                continue
-            end, before = poses.rest(k, x), earlier.rest(k, start)
-            there, _ = self.walls[k].planes(before + part * (end - before))
-            there = between.turned(k, there)
-            turn = np.einsum("mi,mi->m", there, poses.turned(k, self.walls[k].planes(end)[0]))
-            acting[:, s] = np.where((turn > TURN)[:, None], there, 0.0)
+                acting[:, self.slots(k)] = between.turned(k, own)
+            elif not self.flat[s]:
+                end, before = poses.rest(k, x), earlier.rest(k, start)
+                there = between.turned(k, self.walls[k].planes(before + part * (end - before))[0])
+                turn = np.einsum("mi,mi->m", there, poses.turned(k, self.walls[k].planes(end)[0]))
+                acting[:, s] = np.where((turn > TURN)[:, None], there, 0.0)
         return acting
 
     def sums(
@@ -564,11 +499,8 @@ class NodeWalls:
         (m, 3); ``friction``: energy dissipated in the step [J]."""
         x, acts = at
         moment = self.of_walls(np.cross(acts[:, None, :], force).sum(axis=0))
-        contacts = touching
-        if len(self.first) < len(self.wall_of):
-            contacts = np.logical_or.reduceat(touching, self.first, axis=1)
-        force = self.of_walls(force.sum(axis=0))
-        return WallForces(force, contacts.sum(axis=0), moment, nodes, touching, x, friction)
+        contacts = np.logical_or.reduceat(touching, self.first, axis=1).sum(axis=0)
+        return WallForces(self.of_walls(force.sum(axis=0)), contacts, moment, nodes, touching, x, friction)
 
     def infeasible_message(self, node: int, offsets: np.ndarray) -> str:
         """Return the message about a node (owned index) whose planes (slots,) are infeasible together."""

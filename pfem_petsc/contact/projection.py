@@ -11,7 +11,8 @@ import numpy as np
 
 from ..mechanics.compiled import NEEDED, inlined, kernel
 from ..tolerances import FREE_PART, SINGULAR_ROW
-from .sweeps import Pushes, RubbingRows, settle_friction
+from .rotations import add_to, dot, free_components, minus, put, vector
+from .sweeps import NO_DRAG, Pushes, RubbingRows, compliance, displace, settle_friction
 
 
 @kernel
@@ -195,12 +196,11 @@ def _add_planes(at, i, n, planes, room):
     for w in range(planes.gaps.shape[1]):
         if not planes.gaps[at, w] < math.inf:
             continue
-        square = 0.0
-        for c in range(3):
-            rows.normals[n, c] = planes.normals[at, w, c]
-            rows.gradients[n, 0, c] = planes.normals[at, w, c] if rows.soft[i, c] > 0.0 else 0.0
-            square += rows.gradients[n, 0, c] * rows.gradients[n, 0, c]
-        if not square > FREE_PART:
+        held = rows.soft[i, 0] == 0.0, rows.soft[i, 1] == 0.0, rows.soft[i, 2] == 0.0
+        free = free_components(vector(planes.normals[at], w), held)
+        put(rows.normals, n, vector(planes.normals[at], w))
+        put(rows.gradients[n], 0, free)
+        if not dot(free, free) > FREE_PART:
             continue
         rows.values[n], rows.weights[n, 0], room.slot[n] = planes.gaps[at, w], 1.0, w
         rows.friction[n, 0] = rows.friction[n, 1] = 0.0
@@ -208,20 +208,9 @@ def _add_planes(at, i, n, planes, room):
             rows.ends[n, k] = i if k == 0 else -1
         if len(planes.friction) > 0:
             rows.friction[n, 0], rows.friction[n, 1] = planes.friction[at, w, 0], planes.friction[at, w, 1]
-            for c in range(3):
-                rows.slips[n, c] = planes.slips[at, w, c]
+            put(rows.slips, n, vector(planes.slips[at], w))
         n += 1
     return n
-
-
-@inlined
-def _push(a, force, rows, moves):
-    """Displace the nodes of a row by a force."""
-    for k in range(rows.ends.shape[1]):
-        i = rows.ends[a, k]
-        if i >= 0:
-            for c in range(3):
-                moves[i, c] += force * rows.gradients[a, k, c] * rows.soft[i, c]
 
 
 @kernel
@@ -243,7 +232,7 @@ def _solve_several(n, rows, tolerances, pushes):
     if not found and tolerances[0] < tolerances[1]:
         found = find_multipliers(gram, values, tolerances[1], normal)
     for a in range(n if found else 0):
-        _push(a, normal[a], rows, pushes.moves)
+        displace(a, normal[a], NO_DRAG, rows, pushes.moves)
     return found
 
 
@@ -262,13 +251,8 @@ def _solve_rows(n, rows, tolerances, size, pushes):
     if not broken:
         return 0
     if n == 1:
-        gives = 0.0
-        for k in range(rows.ends.shape[1]):
-            i = rows.ends[0, k]
-            for c in range(3 if i >= 0 else 0):
-                gives += rows.gradients[0, k, c] * rows.gradients[0, k, c] * rows.soft[i, c]
-        normal[0] = -rows.values[0] / gives
-        _push(0, normal[0], rows, moves)
+        normal[0] = -rows.values[0] / compliance(0, rows)
+        displace(0, normal[0], NO_DRAG, rows, moves)
     if (n == 1 and not normal[0] < math.inf) or (n > 1 and not _solve_several(n, rows, tolerances, pushes)):
         return INFEASIBLE
     return 0 if settle_friction(n, rows, size, pushes) else JAMMED
@@ -278,24 +262,20 @@ def _solve_rows(n, rows, tolerances, size, pushes):
 def _press_single(j, nodes, tolerance, found):
     """Move the j-th node, which is ``found`` where it is free to move, onto the only plane that it is beyond, if it has
     no friction and all others remain satisfied; return whether that is so."""
-    (normals, gaps, friction, _), broken, first, square = nodes.planes, 0, 0, 0.0
+    (normals, gaps, friction, _), broken, first = nodes.planes, 0, 0
     for k in range(gaps.shape[1]):
         if gaps[j, k] < 0.0:
             broken, first = broken + 1, k
     if broken != 1 or (len(friction) > 0 and friction[j, first, 1] > 0.0):
         return broken == 0
-    for c in range(3):
-        square += 0.0 if nodes.fixed[j, c] else normals[j, first, c] * normals[j, first, c]
-    if not square > FREE_PART:
+    free = free_components(vector(normals[j], first), nodes.fixed[j])
+    if not dot(free, free) > FREE_PART:
         return False
-    push, alone = -gaps[j, first] / square, True
-    for c in range(3):
-        found.x[j, c] += 0.0 if nodes.fixed[j, c] else push * normals[j, first, c]
-    for k in range(gaps.shape[1] if gaps.shape[1] > 1 else 0):
-        gap = gaps[j, k]
-        for c in range(3):
-            gap += normals[j, k, c] * (found.x[j, c] - nodes.free[j, c])
-        alone = alone and (k == first or gap >= -tolerance)
+    push, alone = -gaps[j, first] / dot(free, free), True
+    add_to(found.x, j, push, free)
+    moved = minus(vector(found.x, j), vector(nodes.free, j))
+    for k in range(gaps.shape[1]):
+        alone = alone and (k == first or gaps[j, k] + dot(vector(normals[j], k), moved) >= -tolerance)
     found.normal[j, first] = push * nodes.stiffness[j]
     return alone
 
@@ -337,14 +317,13 @@ def press(which, nodes, tolerance, found, several):
         if why > 0 and failed < 0:
             failed, reason = j, why
         solved = why != INFEASIBLE
-        for k in range(w):
-            found.normal[j, k] = 0.0
+        found.normal[j, :] = 0.0
         for a in range(n if solved else 0):
             found.normal[j, slot[a]] = pushes.normal[a]
-            for c in range(3):
-                found.drag[j, slot[a], c] = pushes.drag[a, c]
-        for c in range(3):
-            found.x[j, c] = nodes.free[j, c] + (pushes.moves[0, c] if solved else 0.0)
+            put(found.drag[j], slot[a], vector(pushes.drag, a))
+        put(found.x, j, vector(nodes.free, j))
+        if solved:
+            add_to(found.x, j, 1.0, vector(pushes.moves, 0))
     return failed, reason
 
 
@@ -376,9 +355,7 @@ def project(x, fixed, normals, offsets, tolerance, multipliers):
     gaps = np.empty((m, w))
     for j in range(m):
         for k in range(w):
-            gaps[j, k] = -offsets[j, k]
-            for c in range(3):
-                gaps[j, k] += normals[j, k, c] * x[j, c]
+            gaps[j, k] = dot(vector(normals[j], k), vector(x, j)) - offsets[j, k]
     planes = Planes(normals, gaps, np.empty((0, w, 2)), np.empty((0, w, 3)))
     nodes, found = NodesAtPlanes(x.copy(), fixed, np.ones(m), planes), Pressed(x, multipliers, np.empty((m, w, 3)))
     return press((0, m), nodes, tolerance, found, NEEDED)[0]

@@ -1,4 +1,5 @@
-"""Rotations: matrices, rotation vectors, and the step by which a rigid body turns.
+"""Vectors of three numbers as tuples in compiled loops, whose components may be complex; rotations: matrices, rotation
+vectors, and the step by which a rigid body turns.
 
 A rotation vector psi [rad] has the direction of the axis and the length of the angle, by the right-hand rule.
 """
@@ -12,6 +13,60 @@ from ..mechanics.compiled import inlined, kernel
 _ROUNDS = 50  # of Newton's method, which needs five
 _NEAR = 1e-9  # last move [rad], the square of which is below rounding
 _SMALL = 1e-2  # angle [rad] below which differences of nearly equal numbers are a series
+
+
+@inlined
+def vector(x, i):
+    """Return the first three columns of row i."""
+    return x[i, 0], x[i, 1], x[i, 2]
+
+
+@inlined
+def minus(a, b):
+    """Return a - b."""
+    return a[0] - b[0], a[1] - b[1], a[2] - b[2]
+
+
+@inlined
+def along(a, s, b):
+    """Return a + s b."""
+    return a[0] + s * b[0], a[1] + s * b[1], a[2] + s * b[2]
+
+
+@inlined
+def times(s, a):
+    """Return s a."""
+    return s * a[0], s * a[1], s * a[2]
+
+
+@inlined
+def dot(a, b):
+    """Return the scalar product, without conjugation."""
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+@inlined
+def cross(a, b):
+    """Return the vector product."""
+    return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
+
+
+@inlined
+def put(x, i, a):
+    """Write a to the first three columns of row i."""
+    x[i, 0], x[i, 1], x[i, 2] = a
+
+
+@inlined
+def add_to(x, i, s, a):
+    """Add s a to the first three columns of row i."""
+    put(x, i, along(vector(x, i), s, a))
+
+
+@inlined
+def free_components(a, fixed):
+    """Return a vector without its ``fixed`` components."""
+    return 0.0 if fixed[0] else a[0], 0.0 if fixed[1] else a[1], 0.0 if fixed[2] else a[2]
 
 
 @kernel
@@ -67,8 +122,7 @@ def vectors_of(turns: np.ndarray) -> np.ndarray:
     for k in range(3):
         i, j = (k + 1) % 3, (k + 2) % 3
         products[:, 0, k + 1] = products[:, k + 1, 0] = turns[:, j, i] - turns[:, i, j]
-    largest = np.argmax(np.diagonal(products, axis1=1, axis2=2), axis=1)
-    quaternion = products[np.arange(len(turns)), largest]
+    quaternion = products[np.arange(len(turns)), np.argmax(np.diagonal(products, axis1=1, axis2=2), axis=1)]
     quaternion *= np.where(quaternion[:, :1] < 0.0, -1.0, 1.0)
     sines = np.linalg.norm(quaternion[:, 1:], axis=1)
     angles = 2.0 * np.arctan2(sines, quaternion[:, 0])

@@ -49,17 +49,15 @@ from ..parallel.natural import NaturalOrder
 from .bars_at_walls import BarsAtWalls, damping_of
 from .neighbours import (
     Points,
-    Regions,
     Segments,
     clip,
     closest,
     find_pairs,
     largest_change,
-    make_regions,
     segment_distance,
 )
+from .rotations import add_to, along, dot, minus, put, times, vector
 from .rows import owner_starts, to_owners
-from .vectors import add_to, along, dot, minus, put, times, vector
 
 if TYPE_CHECKING:
     from ..integrators.base import Balance, Scheme
@@ -537,20 +535,6 @@ def add_to_nodes(local, own, force, f):
             k += 1
 
 
-def _numbered(ends: np.ndarray, own: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the distinct numbers (q,) of nodes among ``ends`` (m, 4), ascending, and the ends as places in them; most
-    are in the range of this rank's ``own`` numbers, where they are marked instead of sorted."""
-    mine = (ends >= own[0]) & (ends < own[1])
-    marks = np.zeros(own[1] - own[0] + 1, dtype=np.int64)
-    marks[ends[mine] - own[0] + 1] = 1
-    here, others = own[0] + np.flatnonzero(marks[1:]), np.unique(ends[~mine])
-    numbers = np.concatenate([others[others < own[0]], here, others[others >= own[1]]])
-    places = np.empty(ends.shape, dtype=np.int64)
-    places[mine] = np.searchsorted(others, own[0]) + np.cumsum(marks)[ends[mine] - own[0]]
-    places[~mine] = np.searchsorted(numbers, ends[~mine])
-    return numbers, places
-
-
 class SelfContact:
     """Contact of bars with bars, whose forces are added to those of bars. Construction is collective.
 
@@ -600,31 +584,24 @@ class SelfContact:
         self._friction, self._damping = float(table.friction), damping_of(float(table.restitution))
         self._starts = owner_starts(mesh)
         self._numbers = np.concatenate([mesh.first_node + np.arange(mesh.n_owned), mesh.ghost_numbers])
-        self._make_directory()
+        # ends, radius and stiffness of all bars on the ranks of their slabs
+        ids = mesh.bar_ids[self._bars].astype(np.int64)
+        router = Router(comm, slab_of(ids, mesh.n_bars, comm.size))
+        self._first_bar, end = slab_range(mesh.n_bars, comm.rank, comm.size)
+        self._directory, at = np.zeros((end - self._first_bar, 4)), router.send(ids) - self._first_bar
+        ends, stiffness = self._numbers[mesh.bars[self._bars]], model.bars.stiffness[self._bars]
+        self._directory[at] = router.send(np.column_stack([ends, self._radius[self._bars], stiffness]))
         self._h, self.room, self.implicit, self._steps = 0.0, 0.0, False, "time.step"
         self.between: tuple[int, ...] = ()
         self.dissipated, self.deepest, self.stale = 0.0, 0.0, False
-        self.sums = self._no_sums = np.zeros(6)
+        self.sums = np.zeros(6)
         self._way, self._limit, self._drift, self._most = 0.0, 0.0, np.zeros(3), np.zeros(3)
         self._reference = mesh.points[: mesh.n_owned].copy()
         self._last = self._reference.T.copy()
         self._exchange: GhostExchange | None = None
-        self._near: tuple[Regions, float] | None = None
         self._empty()
         made = BarsAtWalls(model, chosen)
         self.at_walls = made if made.walls else None
-
-    def _make_directory(self) -> None:
-        """Send the ends, radius and stiffness of all bars to the ranks of their slabs."""
-        mesh, comm = self._mesh, self.comm
-        ids = mesh.bar_ids[self._bars].astype(np.int64)
-        router = Router(comm, slab_of(ids, mesh.n_bars, comm.size))
-        begin, end = slab_range(mesh.n_bars, comm.rank, comm.size)
-        at = router.send(ids) - begin
-        self._first_bar, self._directory = begin, np.zeros((end - begin, 4))
-        stiffness = self._model.bars.stiffness[self._bars]
-        ends = self._numbers[mesh.bars[self._bars]]
-        self._directory[at] = router.send(np.column_stack([ends, self._radius[self._bars], stiffness]))
 
     def begin(self, scheme: Scheme, h: float, frequency: float, critical: float) -> None:
         """Take the step [s], the highest frequency of the bars [rad/s] and the critical step [s].
@@ -642,9 +619,8 @@ class SelfContact:
             raise InputError(
                 f'{source}: [self_contact] needs time.mass = "lumped", and no contact.treatment = "mass_redistribution"'
             )
-        room = 1.0
-        if np.isfinite(critical):  # less a tenth, as weights change
-            room = 0.9 * (frequency * h) ** 2 * ((critical / h) ** 2 - 1.0)
+        # less a tenth, as weights change
+        room = 0.9 * (frequency * h) ** 2 * ((critical / h) ** 2 - 1.0) if np.isfinite(critical) else 1.0
         if room < _ROOM:
             raise InputError(
                 f"{source}: time.step = {h:g} s leaves no room for the stiffness of [self_contact] below the critical "
@@ -704,18 +680,16 @@ class SelfContact:
 
     def text(self) -> str:
         """Return what can touch, for the user before a run. Collective."""
-        count = self.comm.allreduce(len(self._bars))
-        return f"{count:,} bars, up to {engineering(self._thick, 'm')} thick"
+        return f"{self.comm.allreduce(len(self._bars)):,} bars, up to {engineering(self._thick, 'm')} thick"
 
     def doubts(self) -> list[str]:
         """Return a text if bars have overlapped deeply. Collective."""
         deepest = self.comm.allreduce(self.deepest, op=MPI.MAX)
-        if not deepest > _DEEP:
-            return []
-        return [
+        text = (
             f"[self_contact]: bars have overlapped by up to {100.0 * deepest:.0f} % of a radius, as contacts must be "
             "soft for this time.step: a smaller one (time.safety) makes them stiffer"
-        ]
+        )
+        return [text] if deepest > _DEEP else []
 
     def hint(self) -> str:
         """Return what to add to the message about a solve that did not converge. Collective."""
@@ -753,8 +727,6 @@ class SelfContact:
 
     def _of_bars(self, ids: np.ndarray) -> np.ndarray:
         """Return ends, radius and stiffness (n, 4) of bars by their numbers (n,). Collective."""
-        if self.comm.size == 1:
-            return self._directory[ids]
         wanted, place = np.unique(ids, return_inverse=True)
         asking = Router(self.comm, slab_of(wanted, self._mesh.n_bars, self.comm.size))
         return asking.reply(self._directory[asking.send(wanted) - self._first_bar])[place.ravel()]
@@ -768,6 +740,8 @@ class SelfContact:
     def _touches(self) -> tuple[np.ndarray, np.ndarray]:
         """Return the numbers of both bars, as one (m,), of the pairs that touch here, and memory, stiffness and largest
         damping (m, width + 2) of each."""
+        if not len(self._state):
+            return self._keys, self._touching
         touch, pairs = self._state == TOUCHING, self._pairs
         return self._keys[touch], np.column_stack([self._memory, pairs.stiffness, pairs.drag])[touch]
 
@@ -775,18 +749,14 @@ class SelfContact:
         """Take pairs of bars (m, 2) from any ranks. Those that touch stay so. Collective."""
         self._asleep = 0.0
         comm, mesh, starts = self.comm, self._mesh, self._starts
-        kept = self._touches() if len(self._state) else (self._keys, self._touching)
-        if comm.size == 1:
-            ids = ids[np.argsort(ids[:, 0] * mesh.n_bars + ids[:, 1])]
-        of_bars = self._of_bars(ids.ravel()).reshape(-1, 2, 4)
+        kept, of_bars = self._touches(), self._of_bars(ids.ravel()).reshape(-1, 2, 4)
         ends, sizes = of_bars[:, :, :2].astype(np.int64).reshape(-1, 4), of_bars[:, :, 2:].reshape(-1, 4)
-        if comm.size > 1:
-            rows = np.hstack([ids, ends, np.ascontiguousarray(sizes).view(np.int64)])
-            rows = to_owners(rows, range(2, 6), starts, comm)
-            ids, ends, sizes = rows[:, :2], rows[:, 2:6], np.ascontiguousarray(rows[:, 6:]).view(np.float64)
-        numbers, ends = _numbered(ends, starts[comm.rank : comm.rank + 2])
+        rows = np.hstack([ids, ends, np.ascontiguousarray(sizes).view(np.int64)])
+        rows = to_owners(rows, range(2, 6), starts, comm)
+        ids, ends, sizes = rows[:, :2], rows[:, 2:6], np.ascontiguousarray(rows[:, 6:]).view(np.float64)
+        numbers, places = np.unique(ends, return_inverse=True)
         self._own = own = (numbers >= starts[comm.rank]) & (numbers < starts[comm.rank + 1])
-        self._at = numbers
+        self._at, ends = numbers, places.reshape(-1, 4)
         self._local = (numbers[own] - starts[comm.rank]).astype(np.int64)
         if self._exchange is not None:
             self._exchange.close()
@@ -854,15 +824,9 @@ class SelfContact:
         return step if step < np.inf else 0.0
 
     def evaluate(self, x: np.ndarray, f: np.ndarray, step: float, commit: bool) -> tuple[float, float]:
-        """Add the forces of :meth:`evaluate_bars`, and find those of walls between nodes; see there. Collective."""
-        stored, _ = self.evaluate_bars(x, f, step, commit)
-        if self.at_walls is not None and commit:
-            self.dissipated += self.at_walls.evaluate(x, step)
-        return stored + (0.0 if self.at_walls is None else self.at_walls.energy), self.dissipated
-
-    def evaluate_bars(self, x: np.ndarray, f: np.ndarray, step: float, commit: bool) -> tuple[float, float]:
-        """Add the forces at positions ``x``, a ``step`` [s] after the last that were committed, to ``f``, both
-        (local, 3); return the stored energy and all that is dissipated [J]. Collective.
+        """Add the forces of bars at positions ``x``, a ``step`` [s] after the last that were committed, to ``f``, both
+        (local, 3), and find those of walls between nodes, if they are committed; return the stored energy and all that
+        is dissipated [J]. Collective.
 
         Forces that are not a number stand for bars of a trial that have passed through each other.
 
@@ -871,33 +835,31 @@ class SelfContact:
         SimulationFailure
             On all ranks, if a bar has passed through another, or may have.
         """
-        found = self._look(x, step, commit)
+        found, sums = self._look(x, step, commit), np.zeros(6)
         if found is None:
             return float(self.sums[ENERGY]), self.dissipated
         arrays, state, law = found
-        if state is None:
-            if commit:
-                self._way, self.sums = law.way, self._no_sums
-                self._last[:] = x[: self._last.shape[1]].T
-            return 0.0, self.dissipated
-        sums = np.zeros(6)
-        passed = evaluate_pairs(self._pairs, state, self._memory, self._spare, arrays, law, sums)
-        if self.implicit and not commit:
-            arrays.force[:] = np.nan if passed else arrays.force
-        else:
-            self._report(
-                passed,
-                "bars {} and {} pass through each other, which the stiffness of [self_contact] did not prevent: reduce "
-                f"{self._steps}, or use more elements, a larger self_contact.radius or lower velocities",
-            )
-        add_to_nodes(self._local, self._own, arrays.force, f)
-        total = self.dissipated + float(sums[DISSIPATED])
+        if state is not None:
+            passed = evaluate_pairs(self._pairs, state, self._memory, self._spare, arrays, law, sums)
+            if self.implicit and not commit:
+                arrays.force[:] = np.nan if passed else arrays.force
+            else:
+                self._report(
+                    passed,
+                    "bars {} and {} pass through each other, which the stiffness of [self_contact] did not prevent: "
+                    f"reduce {self._steps}, or use more elements, a larger self_contact.radius or lower velocities",
+                )
+            add_to_nodes(self._local, self._own, arrays.force, f)
         if commit:
             self._memory, self._spare = self._spare, self._memory
-            self._way, self.dissipated, self.sums = law.way, total, sums
+            self._way, self.sums, self._last[:] = law.way, sums, x[: self._last.shape[1]].T
+            self.dissipated += float(sums[DISSIPATED])
             self.deepest = max(self.deepest, float(sums[DEPTH]))
-            self._last[:] = x[: self._last.shape[1]].T
-        return float(sums[ENERGY]), total
+        stored = float(sums[ENERGY])
+        if self.at_walls is not None:
+            self.dissipated += self.at_walls.evaluate(x, step) if commit else 0.0
+            stored += self.at_walls.energy
+        return stored, self.dissipated
 
     def _look(self, x: np.ndarray, step: float, commit: bool) -> Look | None:
         """Return the nodes of pairs at positions (local, 3), states of the pairs, with those that begin to touch, and
@@ -992,18 +954,13 @@ class SelfContact:
             return 1.0
         x = self._gather(lambda rows: start[rows], 3)
         part, limiting = free_part(self._pairs, x, found[0].x[:, :3] - x)
-        parts = self.comm.allgather((part, tuple(self.ids[limiting - 1].tolist()) if limiting else ()))
-        part, between = min(parts)
+        part, between = min(self.comm.allgather((part, tuple(self.ids[limiting - 1].tolist()) if limiting else ())))
         self.between = between or self.between
         return part
 
     def _any(self, here: int) -> bool:
         """Return whether a number is not zero on some rank. Collective."""
-        if self.comm.size == 1:
-            return here != 0
-        flag = np.array([here != 0], dtype=np.int32)
-        self.comm.Allreduce(MPI.IN_PLACE, flag, op=MPI.MAX)
-        return bool(flag[0])
+        return here != 0 if self.comm.size == 1 else self.comm.allreduce(here != 0, op=MPI.LOR)
 
     def _report(self, failed: int, text: str) -> None:
         """End the run on all ranks if on some rank a pair, counted from 1, has failed. Collective."""
@@ -1016,20 +973,14 @@ class SelfContact:
         mesh, owned = self._mesh, self._mesh.n_owned
         if self._limit > 0.0 and not self.stale:
             motion = self._reference, np.ascontiguousarray(x[:owned])
-            change = largest_change(self.comm, motion, mesh.n_nodes, self._thick + self._skin, self._near)
-            left = self._skin - change
+            left = self._skin - largest_change(self.comm, motion, mesh.n_nodes, self._thick + self._skin)
             if left > 0.25 * self._skin + move:
                 self._limit = way + 0.998 * (left - move)
                 return
         if step > 0.0:
-            moved = self.comm.allreduce((x[:owned] - self._last.T).sum(axis=0)) / mesh.n_nodes
-            self._drift = moved / step
+            self._drift = self.comm.allreduce((x[:owned] - self._last.T).sum(axis=0)) / (mesh.n_nodes * step)
         self._search(x, move)
         self._reference[:] = x[:owned]
-        ends = x[mesh.bars[self._bars]]
-        longest = float(np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1).max(initial=0.0))
-        longest = self.comm.allreduce(longest, op=MPI.MAX)
-        self._near = make_regions(self.comm, self._reference, 6.0 * (longest + self._skin)), longest
         self._limit, self.stale, self._most[:] = way + 0.998 * (self._skin - move), False, 0.0
 
     def of_row(self, name: str) -> float:
@@ -1046,13 +997,12 @@ class SelfContact:
         """What a checkpoint keeps, name to an order and this rank's part. Collective."""
         table = self._table()
         counts = self.comm.allgather(len(table))
-        numbers = sum(counts[: self.comm.rank]) + np.arange(len(table))
-        order = NaturalOrder(self.comm, numbers, sum(counts))
+        order = NaturalOrder(self.comm, sum(counts[: self.comm.rank]) + np.arange(len(table)), sum(counts))
         return {"self_contact.pairs": (order, table)} if sum(counts) else {}
 
     def _table(self) -> np.ndarray:
         """Return numbers and memory (m, width + 3) of the counted pairs that touch."""
-        keys, kept = self._touches() if len(self._state) else (self._keys, self._touching)
+        keys, kept = self._touches()
         counted = self._pairs.counted[self._state == TOUCHING] if len(self._state) else slice(None)
         return np.column_stack([keys, kept])[counted]
 
@@ -1085,8 +1035,7 @@ class SelfContact:
         or no contact there, allowed; zero if these are the same. Collective."""
         same = earlier is not None and np.array_equal(self._radius, earlier._radius)
         same = same and np.array_equal(self.chosen, earlier.chosen)
-        least = 0.0 if same else float(self.sums[OVERLAP])
-        return self.comm.allreduce(least, op=MPI.MAX)
+        return self.comm.allreduce(0.0 if same else float(self.sums[OVERLAP]), op=MPI.MAX)
 
     def take_over(self, earlier: SelfContact | None, x: np.ndarray) -> None:
         """Go on from the end of an earlier stage, with contact of bars or not, at positions (owned, 3). Collective."""

@@ -18,12 +18,14 @@ from typing import NamedTuple
 import numpy as np
 
 from ..mechanics.compiled import inlined, kernel
+from .rotations import add_to, along, dot, minus, put, times, vector
 
 _SWEEPS = 20_000
 _STEADY = 10_000  # sweeps after which those that have not settled go half as far
 _BROKEN = 1_000  # sweeps after which static friction no longer holds: with it there may be no solution
 _SLIDES = 1e-13  # of the position: slips beyond are no rounding
 _OVERSHOOT = 0.9  # of the drag over the normal force, from which on sweeps go a part of the way
+NO_DRAG = 0.0, 0.0, 0.0
 _SETTLED = 1e-15  # of forces and positions: changes that are rounding
 
 
@@ -62,25 +64,52 @@ class Pushes(NamedTuple):
 
 
 @inlined
-def _soft_component(a, c, rows):
-    """Return the displacement of a component of a row's coordinate by a unit force on it."""
-    total = 0.0
+def _softness(a, rows):
+    """Return the displacements of the components of a row's coordinate by unit forces on them."""
+    total = NO_DRAG
     for d in range(rows.ends.shape[1]):
         i = rows.ends[a, d]
         if i >= 0:
-            total += rows.weights[a, d] * rows.weights[a, d] * rows.soft[i, c]
+            total = along(total, rows.weights[a, d] * rows.weights[a, d], vector(rows.soft, i))
     return total
 
 
 @inlined
-def slip_of(a, c, rows, moves):
-    """Return a component of the relative displacement of a row in the step, along its normal and across."""
-    total = rows.slips[a, c]
+def _slip_of(a, rows, moves):
+    """Return the relative displacement of a row in the step, along its normal and across."""
+    total = vector(rows.slips, a)
     for d in range(rows.ends.shape[1]):
         i = rows.ends[a, d]
         if i >= 0:
-            total += rows.weights[a, d] * moves[i, c]
+            total = along(total, rows.weights[a, d], vector(moves, i))
     return total
+
+
+@inlined
+def _across(slip, normal):
+    """Return the part of a slip across a normal."""
+    return along(slip, -dot(slip, normal), normal)
+
+
+@inlined
+def compliance(a, rows):
+    """Return the displacement of a row along its normal by a unit normal force."""
+    total = 0.0
+    for d in range(rows.ends.shape[1]):
+        i = rows.ends[a, d]
+        for c in range(3 if i >= 0 else 0):
+            total += rows.gradients[a, d, c] * rows.gradients[a, d, c] * rows.soft[i, c]
+    return total
+
+
+@inlined
+def displace(a, force, drag, rows, moves):
+    """Displace the nodes of a row by a normal force and a drag."""
+    for d in range(rows.ends.shape[1]):
+        i = rows.ends[a, d]
+        for c in range(3 if i >= 0 else 0):
+            push = force * rows.gradients[a, d, c] + rows.weights[a, d] * drag[c]
+            moves[i, c] += push * rows.soft[i, c]
 
 
 @inlined
@@ -100,29 +129,24 @@ def _slides_along_guide(count, rows, size, pushes):
             a = b
     if a < 0 or not rows.friction[a, 0] > 0.0:
         return False
+    soft = _softness(a, rows)
     for c in range(3):
-        if _soft_component(a, c, rows) > 0.0:
+        if soft[c] > 0.0:
             if free >= 0:
                 return False
             free = c
     if free < 0:
         return False
-    n, along, square = rows.normals[a], 0.0, 0.0
-    for c in range(3):
-        along += slip_of(a, c, rows, pushes.moves) * n[c]
-    for c in range(3):
-        slip = slip_of(a, c, rows, pushes.moves) - along * n[c]
-        square += slip * slip
-    length = math.sqrt(square)
+    n = vector(rows.normals, a)
+    slip = _across(_slip_of(a, rows, pushes.moves), n)
+    length = math.sqrt(dot(slip, slip))
     if not length > _SLIDES * size:
         return False
-    helped = 1.0 - rows.friction[a, 0] * (slip_of(a, free, rows, pushes.moves) - along * n[free]) / (length * n[free])
+    helped = 1.0 - rows.friction[a, 0] * slip[free] / (length * n[free])
     if not helped > _SLIDES:
         return False
     pushes.normal[a] /= helped
-    for c in range(3):
-        slip = slip_of(a, c, rows, pushes.moves) - along * n[c]
-        pushes.drag[a, c] = -rows.friction[a, 0] * pushes.normal[a] * slip / length
+    put(pushes.drag, a, times(-rows.friction[a, 0] * pushes.normal[a] / length, slip))
     return True
 
 
@@ -135,17 +159,12 @@ def _part_of_the_way(count, rows):
     """
     part = 1.0
     for a in range(count):
-        largest, normal, square = 0.0, 0.0, 0.0
-        for d in range(rows.ends.shape[1]):
-            i = rows.ends[a, d]
-            if i >= 0:
-                for c in range(3):
-                    normal += rows.gradients[a, d, c] * rows.gradients[a, d, c] * rows.soft[i, c]
+        largest, normal, square = 0.0, compliance(a, rows), 0.0
         if rows.friction[a, 1] > 0.0:
+            soft = _softness(a, rows)
+            largest = max(soft[0], soft[1], soft[2])
             for c in range(3):
-                soft = _soft_component(a, c, rows)
-                largest = max(largest, soft)
-                square += soft * rows.normals[a, c] * soft * rows.normals[a, c]
+                square += soft[c] * rows.normals[a, c] * soft[c] * rows.normals[a, c]
             ratio = rows.friction[a, 1] * math.sqrt(max(square - normal * normal, 0.0)) / normal
             if ratio > _OVERSHOOT:
                 part = min(part, 1.0 / (1.0 + ratio))
@@ -169,12 +188,11 @@ def settle_friction(count, rows, size, pushes):
     bool
         Whether the sweeps have converged.
     """
-    ends, weights, gradients, normals, values, _, friction, soft, gives = rows
+    values, friction, gives = rows.values, rows.friction, rows.gives
     normal, drag, moves = pushes
     pressed, largest = False, 0.0
     for a in range(count):
-        for c in range(3):
-            drag[a, c] = 0.0
+        put(drag, a, NO_DRAG)
         pressed = pressed or (normal[a] > 0.0 and friction[a, 1] > 0.0)
         largest = max(largest, normal[a])
     if not pressed or _slides_along_guide(count, rows, size, pushes):
@@ -186,11 +204,10 @@ def settle_friction(count, rows, size, pushes):
             part *= 0.5
         for a in range(count):
             gap = values[a]
-            for d in range(ends.shape[1]):
-                i = ends[a, d]
+            for d in range(rows.ends.shape[1]):
+                i = rows.ends[a, d]
                 if i >= 0:
-                    for c in range(3):
-                        gap += gradients[a, d, c] * moves[i, c]
+                    gap += dot(rows.gradients[a, d], moves[i])
             old = normal[a]
             change = max(0.0, old - gap / gives[a, 1]) - old
             if old == 0.0 and change == 0.0:
@@ -198,34 +215,21 @@ def settle_friction(count, rows, size, pushes):
             # where supports leave little of a normal free, rounding is amplified in forces
             limit = _SETTLED * (before + size / gives[a, 1])
             settled = settled and abs(change) <= limit
-            change *= part
-            for d in range(ends.shape[1]):
-                i = ends[a, d]
-                if i >= 0:
-                    for c in range(3):
-                        moves[i, c] += change * gradients[a, d, c] * soft[i, c]
-            normal[a] = old + change
+            displace(a, part * change, NO_DRAG, rows, moves)
+            normal[a] = old + part * change
             largest = max(largest, normal[a])
             if friction[a, 1] == 0.0:
                 continue
             # the force that would stop the slip, limited by Coulomb's law
-            x, y, z = slip_of(a, 0, rows, moves), slip_of(a, 1, rows, moves), slip_of(a, 2, rows, moves)
-            along = x * normals[a, 0] + y * normals[a, 1] + z * normals[a, 2]
-            x = drag[a, 0] - (x - along * normals[a, 0]) / gives[a, 0]
-            y = drag[a, 1] - (y - along * normals[a, 1]) / gives[a, 0]
-            z = drag[a, 2] - (z - along * normals[a, 2]) / gives[a, 0]
-            needed, factor = math.sqrt(x * x + y * y + z * z), 1.0
+            slip = _across(_slip_of(a, rows, moves), vector(rows.normals, a))
+            goal = along(vector(drag, a), -1.0 / gives[a, 0], slip)
+            needed, factor = math.sqrt(dot(goal, goal)), 1.0
             if needed > friction[a, 1 if sweep < _BROKEN else 0] * normal[a]:
                 factor = friction[a, 0] * normal[a] / needed
-            for c in range(3):
-                change = factor * (x if c == 0 else y if c == 1 else z) - drag[a, c]
-                settled = settled and abs(change) <= limit
-                change *= part
-                drag[a, c] += change
-                for d in range(ends.shape[1]):
-                    i = ends[a, d]
-                    if i >= 0:
-                        moves[i, c] += weights[a, d] * change * soft[i, c]
+            turn = minus(times(factor, goal), vector(drag, a))
+            settled = settled and max(abs(turn[0]), abs(turn[1]), abs(turn[2])) <= limit
+            add_to(drag, a, part, turn)
+            displace(a, 0.0, times(part, turn), rows, moves)
         if settled:
             return True
     return False

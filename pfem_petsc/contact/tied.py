@@ -185,8 +185,7 @@ class Ties:
         poses = self.contact.motion.poses(time)
         places = poses.carried(walls, tied_at[nodes])
         relative = v[nodes] - self.contact.motion.rates_at(places, time)[np.arange(len(nodes)), walls]
-        away = np.einsum("ki,ki->k", relative, normals)
-        later = away < -1e-9 * np.linalg.norm(relative, axis=1)
+        later = np.einsum("ki,ki->k", relative, normals) < -1e-9 * np.linalg.norm(relative, axis=1)
         tied_to[nodes[later]] = 0
         along = np.einsum("mji,mj->mi", poses.turns[walls], relative) if len(poses.turns) else relative
         tied_at[nodes] += 0.5 * h * along

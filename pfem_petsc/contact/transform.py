@@ -18,8 +18,7 @@ from ..integrators.base import Balance, State
 from ..parallel.agreement import agreed
 from ..tolerances import FREE_PART, PROJECTED
 from .constraint_set import ConstraintSet
-from .frames import NodalFrames
-from .relative import RelativeCoordinates, pivots
+from .frames import NodalFrames, RelativeCoordinates, pivots
 from .rows import Alike, FreeNodes
 
 if TYPE_CHECKING:
@@ -98,8 +97,7 @@ class RowCoordinates:
         data = rows.gather(data)
         self._part = balance.acting
         self._start = rows.gather(state.position) if self._part < 1.0 else self._start
-        jacobian = rows.gradients(self._acting(rows.gather(x)))
-        self._place(jacobian, data[:, :9].reshape(-1, 3, 3), data[:, 9:] == 0.0)
+        self._place(rows.gradients(self._acting(rows.gather(x))), data[:, :9].reshape(-1, 3, 3), data[:, 9:] == 0.0)
 
     def _acting(self, x: np.ndarray) -> np.ndarray:
         """Places (n, 3) where the forces of the balance act, for nodes that move to (n, 3)."""
@@ -242,8 +240,7 @@ class RowCoordinates:
         """
         node, component, row = self._here
         force, own = g[node, component] / self._scale[row], np.zeros(w.shape)
-        pressed = (w[node, component] <= lower[node, component]) & (force > noise)
-        own[node, component] = np.where(pressed, force, 0.0)
+        own[node, component] = np.where((w[node, component] <= lower[node, component]) & (force > noise), force, 0.0)
         self.constraints.release()
         self.constraints.jacobian = self.jacobian
         self.constraints.force[self._placed] = self._all(own)[self._pivot[self._placed]]
@@ -251,10 +248,10 @@ class RowCoordinates:
     def set_forces(self, nodes: np.ndarray, normal: np.ndarray, drag: np.ndarray) -> None:
         """Set the forces of rows with relative coordinates from those of nodes (m,) in the slots of tables, (m, t) and
         (m, t, 3) [N]. Collective."""
-        constraints, relative = self.constraints, self.relative
-        force, drags = relative.of_rows(normal, drag, nodes)
-        some = relative.carrier >= 0
-        constraints.force[some], constraints.drag[some] = force[some], drags[some]
+        own, some = np.zeros((self.rows.mesh.n_owned, normal.shape[1], 4)), np.flatnonzero(self.relative.carrier >= 0)
+        own[nodes, :, 0], own[nodes, :, 1:] = normal, drag
+        found = self.rows.gather(own)[self.relative.carrier[some], self.rows.source[some]]
+        self.constraints.force[some], self.constraints.drag[some] = found[:, 0], found[:, 1:]
 
     def satisfied(self, x: np.ndarray, slack: float) -> bool:
         """Return whether positions (owned, 3) satisfy the rows that were bounds, to ``slack`` [m]. Collective.
@@ -292,8 +289,7 @@ class RowCoordinates:
 
     def broken(self, x: np.ndarray, slack: float) -> bool:
         """Return whether positions (owned, 3) violate any row by more than ``slack`` [m]. Collective."""
-        usable = self.rows.usable(self.jacobian)
-        return self._any((self.rows.values(self.rows.gather(x))[usable] < -slack).any())
+        return self._any((self.rows.values(self.rows.gather(x))[self.rows.usable(self.jacobian)] < -slack).any())
 
 
 class Transform:
@@ -343,16 +339,12 @@ class Transform:
 
     def forward(self, w: np.ndarray) -> None:
         """Transform w (owned, 3) to u, in place. Collective."""
-        if self.identity:
-            return
         if self.rows is not None:
             self.rows.forward(w)
         w[self._nodes] = np.einsum("nij,nj->ni", self._back, w[self._nodes])
 
     def inverse(self, u: np.ndarray) -> None:
         """Transform u (owned, 3) to w, in place. Collective."""
-        if self.identity:
-            return
         if self.rows is not None:
             self.rows.inverse(u)
         u[self._nodes] = np.einsum("nij,nj->ni", self._basis, u[self._nodes])
@@ -369,8 +361,6 @@ class Transform:
 
     def residual(self, predictor: np.ndarray, u: np.ndarray, g: np.ndarray) -> None:
         """Transform the residual force (owned, 3) at predictor + u to the residual of w, in place. Collective."""
-        if self.identity:
-            return
         self.adjoint(g)
         if self.slides:
             slipping = self.sliding.nodes
@@ -385,8 +375,6 @@ class Transform:
 
         ``left`` : value of :meth:`left` where H was evaluated.
         """
-        if self.identity:
-            return
         self.adjoint(out)
         if self.slides:
             sliding, y = self.sliding, self.positions(u[: self.mesh.n_owned])[self.sliding.nodes]

@@ -1,4 +1,5 @@
-"""Surfaces of triangles in compiled loops: signed distances, and the planes of the faces that stop a node.
+"""Surfaces of triangles in compiled loops: signed distances, the planes of the faces that stop a node, and those that
+nodes touch in a step.
 
 Triangles are in the order of a tree of boxes: box k has the halves 2 k and 2 k + 1 of its triangles, and each of the
 boxes of the last level a few. The sign of a distance is that of its scalar product with the normal of the place nearest
@@ -10,14 +11,14 @@ what is beside the surface is in front of it.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from typing import NamedTuple, Self
+from collections.abc import Callable
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 
 from ..mechanics.compiled import inlined, kernel, record
 from .projection import project
-from .vectors import along, dot, minus, put, times, vector
+from .rotations import along, dot, minus, put, times, vector
 
 ROUNDING = 1e-13
 """Distances below this fraction of the largest coordinate count as zero where planes meet."""
@@ -29,10 +30,16 @@ _IN_LEAF = 4
 _ROUNDS = 8
 """Most planes that are tried for the end of a way; those that do not push give their place to others."""
 
+_SAME = 1.0 - 1e-10
+"""Cosine between the normals of faces of one plane."""
+
+_BEHIND = 2
+"""Mark of nodes that are behind an open surface, which they have passed beside; of others in this step 1, else 0."""
+
 
 @record
 class Triangles(NamedTuple):
-    """A surface of t triangles where it is at rest, or several.
+    """A surface of t triangles where it is at rest.
 
     Attributes
     ----------
@@ -42,14 +49,12 @@ class Triangles(NamedTuple):
     boxes : (2 l, 6) lower and upper corners [m]; the leaves of the tree are the last l
     limits : (1, 3) 1.0 if the surface stops nodes from either side, else 0.0; the distance [m] at which it stops them;
         the rounding of distances [m]
-    starts : (s + 1, 3) first row in ``points``, ``boxes``, ``limits`` of each of s surfaces
     """
 
     points: np.ndarray
     normals: np.ndarray
     boxes: np.ndarray
     limits: np.ndarray
-    starts: np.ndarray
 
     @classmethod
     def of(cls, points: np.ndarray, corners: np.ndarray, both: bool = False, clearance: float = 0.0) -> Self:
@@ -70,16 +75,7 @@ class Triangles(NamedTuple):
             boxes[leaves : 2 * leaves, :3] = halves[:, :, :3].min(axis=1)
             boxes[leaves : 2 * leaves, 3:] = halves[:, :, 3:].max(axis=1)
         limits = np.array([[float(both), clearance, ROUNDING * np.abs(places).max()]])
-        starts = np.array([[0, 0, 0], [len(places), len(boxes), 1]])
-        return cls(places, _normals(places, corners[order]), boxes, limits, starts)
-
-    @classmethod
-    def joined(cls, surfaces: Sequence[Triangles]) -> Triangles:
-        """Return several surfaces as one record, of which :func:`surface` takes one."""
-        none = cls(np.empty((0, 3, 3)), np.empty((0, 7, 3)), np.empty((0, 6)), np.empty((0, 3)), np.zeros((1, 3), int))
-        *arrays, _ = (np.concatenate(parts) for parts in zip(none, *surfaces, strict=True))
-        ends = [each.starts[-1] for each in surfaces]
-        return cls(*arrays, starts=np.cumsum([none.starts[0], *ends], axis=0))
+        return cls(places, _normals(places, corners[order]), boxes, limits)
 
 
 def _sorted_by_place(centres: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -119,15 +115,6 @@ def _normals(places: np.ndarray, corners: np.ndarray) -> np.ndarray:
 
 
 @inlined
-def surface(triangles, k):
-    """Return surface k of several, :meth:`Triangles.joined`."""
-    starts = triangles.starts[k : k + 2]
-    points, normals = triangles.points[starts[0, 0] : starts[1, 0]], triangles.normals[starts[0, 0] : starts[1, 0]]
-    boxes, limits = triangles.boxes[starts[0, 1] : starts[1, 1]], triangles.limits[starts[0, 2] : starts[1, 2]]
-    return Triangles(points, normals, boxes, limits, starts)
-
-
-@inlined
 def _arm(points, normals, place):
     """Return the vector from the nearest place of a triangle (3, 3) to another place, and what that lies on: 0 the
     face, 1 to 3 an edge, 4 to 6 a corner (C. Ericson, Real-Time Collision Detection, 2005, section 5.1.5)."""
@@ -157,6 +144,13 @@ def _away(box, low, high):
     x, y = max(box[0] - high[0], low[0] - box[3], 0.0), max(box[1] - high[1], low[1] - box[4], 0.0)
     z = max(box[2] - high[2], low[2] - box[5], 0.0)
     return x * x + y * y + z * z
+
+
+@inlined
+def _box(one, other):
+    """Return the lower and upper corner of the box of two places (3,)."""
+    low = min(one[0], other[0]), min(one[1], other[1]), min(one[2], other[2])
+    return low, (max(one[0], other[0]), max(one[1], other[1]), max(one[2], other[2]))
 
 
 @inlined
@@ -259,8 +253,7 @@ def _crossed(triangles, start, place, tolerance, least):
     slack, way = max(tolerance, rounding), math.sqrt(_square(start, place))
     # a node that falls on an edge along one of its faces is stopped, one that has been stopped moves along them
     ahead = -least if least > 0.0 else rounding
-    low = min(start[0], place[0]), min(start[1], place[1]), min(start[2], place[2])
-    high = max(start[0], place[0]), max(start[1], place[1]), max(start[2], place[2])
+    low, high = _box(start, place)
     leaf = _next_leaf(triangles, 0, low, high, 3.0 * slack * slack)
     while leaf > 0:
         for j in _of_leaf(triangles, leaf):
@@ -359,20 +352,185 @@ def faces_at(triangles, start, free, fixed, tolerance, normals, offsets):
 
 
 @kernel
-def signed_distances(triangles, k, x, reach, distances, faces, places):
-    """Write :func:`nearest` of points (m, 3) to surface k into distances (m,), faces (m, 2), with what of them is
-    nearest, and places (m, 3)."""
-    one = surface(triangles, k)
-    for i in range(len(x)):
-        distances[i], faces[i, 0], faces[i, 1], places[i, 0], places[i, 1], places[i, 2] = nearest(
-            one, x[i, 0], x[i, 1], x[i, 2], reach
-        )
+def stopping_faces(triangles, ways, fixed, tolerance, normals, offsets):
+    """Write :func:`faces_at` of nodes that move from ``ways[0]`` to ``ways[1]``, (2, m, 3), with the ``fixed``
+    components (m, 3) bool and the tolerance (m,), into normals (m, 3, 3) and offsets (m, 3)."""
+    for i in range(ways.shape[1]):
+        faces_at(triangles, ways[0, i], ways[1, i], fixed[i], tolerance[i], normals[i], offsets[i])
+
+
+@inlined
+def _tangent(triangles, x):
+    """Return the distance of a position (3,) from the surface [m], and the plane through the nearest place across the
+    way there: its normal, and its offset, which is -inf for a position that is no number."""
+    distance, face, feature, px, py, pz = nearest(triangles, x[0], x[1], x[2], math.inf)
+    if face < 0:
+        return distance, (0.0, 0.0, 0.0), -math.inf
+    both, clearance, rounding = triangles.limits[0, 0] > 0.0, triangles.limits[0, 1], triangles.limits[0, 2]
+    side = -1.0 if distance < 0.0 and not both else 1.0
+    normal = times(side / max(abs(distance), 1e-300), minus(x, (px, py, pz)))
+    if abs(distance) <= 1e3 * rounding:  # the direction from the place is that of rounding
+        normal = vector(triangles.normals[face], feature)
+    if not dot(normal, normal) > 0.0:  # at the border of an open surface
+        normal = vector(triangles.normals[face], 0)
+    normal = times(1.0 / math.sqrt(dot(normal, normal)), normal)
+    return (abs(distance) if both else distance) - clearance, normal, clearance + dot(normal, (px, py, pz))
 
 
 @kernel
-def stopping_faces(triangles, k, ways, fixed, tolerance, normals, offsets):
-    """Write :func:`faces_at` of nodes that move from ``ways[0]`` to ``ways[1]``, (2, m, 3) relative to surface k, with
-    the ``fixed`` components (m, 3) bool and the tolerance (m,), into normals (m, 3, 3) and offsets (m, 3)."""
-    one = surface(triangles, k)
-    for i in range(ways.shape[1]):
-        faces_at(one, ways[0, i], ways[1, i], fixed[i], tolerance[i], normals[i], offsets[i])
+def tangent_planes(triangles, x, normals, offsets, distances):
+    """Write the planes nearest to positions (m, 3), and their distances from the surface, into normals (m, 3), offsets
+    and distances (m,) [m]."""
+    for i in range(len(x)):
+        distances[i], normal, offsets[i] = _tangent(triangles, x[i])
+        put(normals, i, normal)
+
+
+@kernel
+def _mark_near(triangles, starts, ends, reach, slack, near):
+    """Mark nodes that move from ``starts`` to ``ends`` (n, 3) and come within ``reach`` (n,) or (1,) of the surface
+    there, or, with a reach that is not positive, are behind it by more than that."""
+    normals, offsets, fixed = np.empty((3, 3)), np.empty(3), np.zeros(3, np.bool_)
+    for i in range(len(ends)):
+        limit = reach[i] if len(reach) > 1 else reach[0]
+        least = max(limit, 0.0) + triangles.limits[0, 1]
+        beyond = least + slack[i]
+        if _away(triangles.boxes[1], *_box(starts[i], ends[i])) > 3.0 * beyond * beyond:
+            continue
+        if limit > 0.0:
+            near[i] = abs(nearest(triangles, ends[i, 0], ends[i, 1], ends[i, 2], beyond)[0]) < least
+        if not near[i] and faces_at(triangles, starts[i], ends[i], fixed, slack[i], normals, offsets) > 0:
+            for k in range(3):
+                gap = dot(vector(normals, k), ends[i]) - offsets[k] if offsets[k] > -math.inf else math.inf
+                near[i] = near[i] or gap < min(limit, 0.0)
+
+
+@inlined
+def _put(i, j, normal, offset, table, kept):
+    """Give node i, the j-th of some, a plane, in the slot in which it touched it before, or else in one that is free: a
+    node that touches another face has hit it."""
+    _, normals, offsets = table
+    before, occupied = kept
+    best, slot = -1, 0
+    for k in range(3):
+        if offsets[i, k] > -math.inf:
+            continue
+        value = 1 if not occupied[j, k] else (2 if dot(normal, before[i, 3 * k : 3 * k + 3]) > _SAME else 0)
+        if value > best:
+            best, slot = value, k
+    offsets[i, slot] = offset
+    put(normals[i], slot, normal)
+    put(before[:, 3 * slot :], i, normal)
+
+
+@kernel
+def _find(triangles, nodes, ways, tolerance, table, kept):
+    """Find the planes of nodes (m,) on their ways; return whether any changed.
+
+    Parameters
+    ----------
+    ways : starts and ends (m, 3), fixed (m, 3) bool, and by how much each may have been behind the surface (m,) [m]
+    table : marks of nodes (owned,), their normals (owned, 3, 3) and offsets (owned, 3)
+    kept : normals (owned, 9) of the planes of earlier steps, and which of these they touch (m, 3) bool
+    """
+    starts, ends, fixed, slack = ways
+    known, normals, offsets = table
+    changed, both = False, triangles.limits[0, 0] > 0.0
+    own, level = np.zeros((3, 3)), np.empty(3)
+    for j in range(len(nodes)):
+        i, x = nodes[j], ends[j]
+        if known[i] == _BEHIND:
+            continue
+        if not known[i]:
+            known[i], offsets[i, :], changed = 1, -math.inf, True
+            if faces_at(triangles, starts[j], x, fixed[j], slack[j], own, level) == 0 and tolerance > 0.0:
+                if not both and _tangent(triangles, starts[j])[0] < -slack[j]:
+                    known[i] = _BEHIND
+                    continue
+                _, normal, level[0] = _tangent(triangles, x)
+                put(own, 0, normal)
+            for k in range(3):
+                if level[k] > -math.inf:
+                    _put(i, j, vector(own, k), level[k], table, kept)
+            continue
+        distance, normal, offset = _tangent(triangles, x)
+        on, there, worst, farthest = False, False, 0, -math.inf
+        for k in range(3):
+            gap = math.inf
+            if offsets[i, k] > -math.inf:
+                gap = dot(vector(normals[i], k), x) - offsets[i, k]
+                on = on or abs(gap) <= tolerance
+                same = dot(vector(normals[i], k), normal) > _SAME
+                there = there or (same and abs(offsets[i, k] - offset) <= tolerance)
+            if gap > farthest:
+                worst, farthest = k, gap
+        if distance > tolerance and on:  # on the plane of a face, beside it
+            offsets[i, :] = -math.inf
+        elif there or not distance < -tolerance:  # else a plane found for the same position would take all slots
+            continue
+        changed = True
+        offsets[i, worst] = -math.inf
+        _put(i, j, normal, offset, table, kept)
+    return changed
+
+
+class TouchedFaces:
+    """The planes, up to three, along which nodes touch a surface of triangles in a step. Positions are those relative
+    to the surface, as it is at rest.
+
+    Parameters
+    ----------
+    triangles : Triangles, for loops
+    planes_of : returns the planes nearest to positions, see :class:`~pfem_petsc.contact.walls.base.BaseWall`
+    n_owned : number of nodes
+    """
+
+    def __init__(
+        self, triangles: Any, planes_of: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]], n_owned: int
+    ) -> None:
+        self._triangles, self._planes_of = triangles, planes_of
+        self._table = np.zeros(n_owned, dtype=np.int8), np.zeros((n_owned, 3, 3)), np.full((n_owned, 3), -np.inf)
+
+    def forget(self) -> None:
+        """Begin a step."""
+        self._table[0][:] = 0
+
+    def near(self, starts: np.ndarray, ends: np.ndarray, reach: np.ndarray, slack: np.ndarray) -> np.ndarray:
+        """Return (n,) bool: nodes that move from ``starts`` to ``ends`` (n, 3) [m] and come within ``reach``, (n,) or
+        (1,) [m], of the surface, or, if it is not positive, end behind it by more than that; ``slack`` (n,): by how
+        much each may have been behind it at the start [m]."""
+        near = np.zeros(len(ends), dtype=bool)
+        _mark_near(self._triangles, starts, np.ascontiguousarray(ends), reach, slack, near)
+        return near
+
+    def find(
+        self,
+        nodes: np.ndarray,
+        ways: tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray],
+        tolerance: float,
+        kept: tuple[np.ndarray, np.ndarray],
+    ) -> bool:
+        """Find planes of nodes (m,), beside those that were found in this step; return whether there are others now.
+
+        A node that is behind the surface although it satisfies its planes gets one more; one that is on the plane of a
+        face, but beside it, gets that of the nearest place. ``ways``, ``kept``: see :func:`_find`; ``tolerance``: depth
+        that counts as zero [m]; without any, nodes that are not stopped have no plane.
+        """
+        starts, ends, fixed, slack = ways
+        ways = np.ascontiguousarray(starts), np.ascontiguousarray(ends), fixed, slack
+        return bool(_find(self._triangles, nodes, ways, tolerance, self._table, kept))
+
+    def planes(self, nodes: np.ndarray | None, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the normals (m, 3, 3) of the planes of nodes (m,) at (m, 3), and distances along them (m, 3) [m],
+        infinite for none; of nodes for which none were sought, or of no nodes, the plane of the nearest place."""
+        known, normals, offsets = self._table
+        at, shape = np.arange(len(x)), (len(x), 3)
+        if nodes is None:
+            normals, offsets = np.zeros((*shape, 3)), np.full(shape, -np.inf)
+        else:
+            normals, offsets, at = normals[nodes], offsets[nodes], np.flatnonzero(known[nodes] == 0)
+        if len(at):
+            slots = slice(1 if nodes is None else 3)
+            own, level = self._planes_of(x[at])
+            normals[at, slots], offsets[at, slots] = own[:, None], level[:, None]
+        return normals, np.einsum("mki,mi->mk", normals, x) - offsets

@@ -31,10 +31,6 @@ class Poses(NamedTuple):
         x = x - self.shifts[k]
         return x @ self.turns[k] if len(self.turns) else x
 
-    def reached(self, k: int, x: np.ndarray) -> np.ndarray:
-        """Return where points of wall k are that are at (m, 3) at rest."""
-        return self.turned(k, x) + self.shifts[k]
-
     def carried(self, walls: np.ndarray, x: np.ndarray) -> np.ndarray:
         """Return where points of walls (m,) are that are at (m, 3) at rest, each of one wall."""
         return (np.einsum("mij,mj->mi", self.turns[walls], x) if len(self.turns) else x) + self.shifts[walls]
@@ -47,8 +43,7 @@ class Poses(NamedTuple):
         """Return how far the points of all walls at (m, 3) are from there at ``later`` poses, (m, w, 3) [m]."""
         if not len(self.turns):
             return np.broadcast_to(later.shifts - self.shifts, (len(x), *self.shifts.shape))
-        turns = later.turns @ self.turns.swapaxes(1, 2)
-        moved = np.einsum("wij,mwj->mwi", turns, x[:, None, :] - self.shifts)
+        moved = np.einsum("wij,mwj->mwi", later.turns @ self.turns.swapaxes(1, 2), x[:, None, :] - self.shifts)
         return moved + later.shifts - x[:, None, :]
 
 
@@ -191,8 +186,7 @@ class WallMotion:
 
     def torques(self, force: np.ndarray, moment: np.ndarray, time: float) -> np.ndarray:
         """Return the moments (w,) [N m] about the axes of rotation of forces (w, 3) with moments about the origin."""
-        centres = self._centres + self.displacements(time)
-        return np.einsum("wi,wi->w", self._axes, moment - np.cross(centres, force))
+        return np.einsum("wi,wi->w", self._axes, moment - np.cross(self._centres + self.displacements(time), force))
 
     def angles(self, time: float) -> np.ndarray:
         """Return the angles (w,) [rad] by which walls have turned at a time [s]."""

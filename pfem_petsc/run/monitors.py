@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ..columns import LOST, STORED, SUPPLIED
-from ..contact.monitoring import CrossingBars
+from ..contact.neighbours import CrossingBars
 from ..errors import SimulationFailure
 from ..output.units import LOAD_FACTOR, TIME
 

@@ -15,7 +15,8 @@ import numpy as np
 from mpi4py import MPI
 
 from ..columns import Fields, Row, Snapshot
-from ..contact.monitoring import Piercing, check_positions
+from ..contact.bars_at_walls import Piercing
+from ..contact.contact import check_positions
 from ..errors import SimulationFailure
 from ..files import FolderLock
 from ..output.checkpoint import write_checkpoint

@@ -11,9 +11,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from ..contact.initial_equilibrium import start_at_rest
-from ..contact.massless import MasslessNodes
-from ..contact.monitoring import CarriedNodes
+from ..contact.active_set import start_at_rest
+from ..contact.contact import CarriedNodes
 from ..contact.node_walls import WallForces
 from ..errors import SimulationFailure
 from ..integrators.base import Balance, Scheme, State
@@ -271,7 +270,8 @@ class Stepper(ABC):
         )
         self.before = mesh.points.copy()
         model.contact.state = self.state
-        self.massless = MasslessNodes(model) if model.inertia.redistribution is not None else None
+        moved = model.inertia.redistribution
+        self.massless = None if moved is None else moved.massless(model)
         self.step_changed = False
         self.support_changes = 0
         self.prescribed = PrescribedMotion(self)

@@ -5,7 +5,7 @@ import re
 import pytest
 
 from pfem_petsc import Case, Simulation
-from pfem_petsc.contact.monitoring import check_positions
+from pfem_petsc.contact.contact import check_positions
 from pfem_petsc.errors import SimulationFailure
 from pfem_petsc.tolerances import BEYOND
 

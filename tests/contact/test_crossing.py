@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from pfem_petsc import Case, Simulation, Truss
-from pfem_petsc.contact.monitoring import CrossingBars
+from pfem_petsc.contact.neighbours import CrossingBars
 from pfem_petsc.errors import SimulationFailure
 from pfem_petsc.stepping.model import Model
 

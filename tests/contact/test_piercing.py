@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from pfem_petsc import Case, Simulation
-from pfem_petsc.contact.monitoring import distances
+from pfem_petsc.contact.walls import cylinder, sphere
+from pfem_petsc.contact.walls.base import deepest
 from pfem_petsc.preflight import warnings_before
 
 SHAPES = {
@@ -79,15 +80,18 @@ def test_a_chord_of_a_wall_is_no_defect(comm, shared_tmp_path, capfd):
     assert "only nodes touch walls" not in capfd.readouterr().err
 
 
-def test_distances_against_sampling():
+@pytest.mark.parametrize("kind", [sphere, cylinder])
+def test_deepest_places_against_sampling(kind):
     rng = np.random.default_rng(4)
-    starts, ends, point = rng.normal(size=(50, 3)), rng.normal(size=(50, 3)), rng.normal(size=3)
-    axis = np.array([0.6, 0.0, 0.8])
+    ends = rng.normal(size=(50, 2, 3))
+    keys = {"axis": [0.6, 0.0, 0.8]} if kind is cylinder else {}
+    keys |= {"name": "it", "type": kind.__name__.rpartition(".")[2], "point": [0.1, 0.0, 0.0], "radius": 0.7}
+    wall = kind.Wall(kind.Parameters(**keys))
     part = np.linspace(0.0, 1.0, 4001)[:, None, None]
-    away = starts + part * (ends - starts) - point
-    np.testing.assert_allclose(
-        distances(starts, ends, point, None), np.linalg.norm(away, axis=2).min(axis=0), atol=2e-3
-    )
-    np.testing.assert_allclose(
-        distances(starts, ends, point, axis), np.linalg.norm(np.cross(away, axis), axis=2).min(axis=0), atol=2e-3
-    )
+    gaps = wall.gaps((ends[:, 0] + part * (ends[:, 1] - ends[:, 0])).reshape(-1, 3)).reshape(len(part), -1)
+    within = (gaps.argmin(axis=0) % 4000 > 0) & (gaps.min(axis=0) < 0.0)
+    where, least = deepest(wall.gaps, ends)
+    assert 5 < within.sum() < 50 and np.isinf(least[gaps.argmin(axis=0) % 4000 == 0]).all()
+    np.testing.assert_allclose(least[within], gaps.min(axis=0)[within], atol=1e-5)
+    np.testing.assert_allclose(where[within], part[gaps.argmin(axis=0)[within], 0, 0], atol=2e-3)
+    np.testing.assert_array_equal(wall.crossed(ends[:, 0], ends[:, 1]), least < -0.25 * 0.7)

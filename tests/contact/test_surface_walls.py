@@ -182,7 +182,7 @@ def test_planes_are_those_of_the_nearest_places(tmp_path, side, shape):
         distance if signed else np.abs(distance), wall.gaps(x) if signed else np.abs(wall.gaps(x))
     )
     feet = x - (distance + 0.5 * wall.triangles.limits[0, 1] * 2)[:, None] * normals
-    np.testing.assert_allclose(wall._nearest(feet)[0], 0.0, atol=1e-14)
+    np.testing.assert_allclose(wall.gaps(feet) + wall.triangles.limits[0, 1], 0.0, atol=1e-14)
     below = np.array([[0.0, 0.0, -0.3 if shape == "groove" else 0.4]])
     expected = {"ballfront": -0.6, "ballboth": 0.6, "groovefront": 0.3, "grooveboth": 0.3}[shape + side]
     assert wall.gaps(below)[0] == pytest.approx(expected - 0.01 * (side == "both"), abs=0.03)

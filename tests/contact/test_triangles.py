@@ -6,24 +6,32 @@ import pytest
 from helpers.triangles import ball, box, groove, torus
 
 from pfem_petsc.contact.projection import project
-from pfem_petsc.contact.triangles import Triangles, signed_distances, stopping_faces
-from pfem_petsc.mechanics.compiled import by_reference
+from pfem_petsc.contact.triangles import Triangles, nearest, stopping_faces
+from pfem_petsc.mechanics.compiled import by_reference, kernel
 
 BODIES = {"box": box((-1.0, -0.6, -0.3), (1.0, 0.6, 0.3)), "ball": ball(2), "torus": torus()}
 
 
-def query(triangles, x, reach=np.inf, part=0):
+@kernel
+def signed_distances(triangles, x, reach, distances, faces, places):
+    for i in range(len(x)):
+        distances[i], faces[i, 0], faces[i, 1], places[i, 0], places[i, 1], places[i, 2] = nearest(
+            triangles, x[i, 0], x[i, 1], x[i, 2], reach
+        )
+
+
+def query(triangles, x, reach=np.inf):
     distances, faces, places = np.empty(len(x)), np.empty((len(x), 2), np.int64), np.empty((len(x), 3))
-    signed_distances(by_reference(triangles), part, x, reach, distances, faces, places)
+    signed_distances(by_reference(triangles), x, reach, distances, faces, places)
     return distances, faces, places
 
 
-def stopped(triangles, start, free, tolerance=1e-9, part=0, fixed=None):
+def stopped(triangles, start, free, tolerance=1e-9, fixed=None):
     """Where nodes get to, and the planes that stop them."""
     fixed = np.zeros((len(free), 3), bool) if fixed is None else fixed
     normals, offsets = np.zeros((len(free), 3, 3)), np.zeros((len(free), 3))
     ways = np.stack([start, free])
-    stopping_faces(by_reference(triangles), part, ways, fixed, np.full(len(free), tolerance), normals, offsets)
+    stopping_faces(by_reference(triangles), ways, fixed, np.full(len(free), tolerance), normals, offsets)
     end = free.copy()
     assert project(end, fixed, normals, offsets, 1e-13, np.empty((len(free), 3))) == -1
     return end, normals, offsets
@@ -108,17 +116,6 @@ def test_triangles_of_very_different_sizes():
         np.abs(query(triangles, x)[0]), distances_to_all(triangles.points, x).min(axis=1), atol=1e-12
     )
     assert len(triangles.boxes) <= len(triangles.points)
-
-
-def test_several_surfaces_in_one_record():
-    each = [Triangles.of(*BODIES["box"]), Triangles.of(*groove(), True, 1e-3), Triangles.of(*BODIES["ball"])]
-    joined = Triangles.joined(each)
-    x = np.random.default_rng(4).normal(size=(60, 3))
-    for k, one in enumerate(each):
-        for found, expected in zip(query(joined, x, 0.7, k), query(one, x, 0.7), strict=True):
-            np.testing.assert_array_equal(found, expected)
-        for found, expected in zip(stopped(joined, x, -x, part=k), stopped(one, x, -x), strict=True):
-            np.testing.assert_array_equal(found, expected)
 
 
 def test_groove_stops_nodes_as_two_planes_do():

@@ -158,6 +158,11 @@ class Treatment(ABC):
             change[:] = 0.0
 
 
+def across(vectors: np.ndarray, normals: np.ndarray) -> np.ndarray:
+    """Return the parts of vectors (m, w, 3) across normals (m, w, 3)."""
+    return vectors - np.einsum("mwi,mwi->mw", vectors, normals)[:, :, None] * normals
+
+
 STILL = 1e-13  # of the model's length: a slip that is rounding
 _NONE = 1e-9  # of a force: what of it is rounding, and of the tolerance of the solve
 
@@ -183,17 +188,14 @@ class Restitution(Treatment):
         if self._frees:
             mine = self._touched if self.everywhere else self._touched & (contact.restitution > 0.0)
             self._held = np.flatnonzero(mine.any(axis=1))
-            change = state.memory.get("contact_change")
-            pressed = state.contact[self._held]
-            self._force = pressed + (0.0 if change is None else change[self._held])
+            total = state.contact + state.memory.get("contact_change", 0.0)
+            self._force = total[self._held]
             # a node that leaves by restitution has had its force removed up to rounding
-            none = np.linalg.norm(self._force, axis=1) <= _NONE * np.linalg.norm(pressed, axis=1)
-            self._force[none] = 0.0
-        self._pressed = links.force > 0.0
-        self._push = None
+            least = _NONE * np.linalg.norm(state.contact[self._held], axis=1)
+            self._force[np.linalg.norm(self._force, axis=1) <= least] = 0.0
+        self._pressed, self._push = links.force > 0.0, None
         if self._frees and (self.everywhere or links.rows.rebounds) and links.any_pressed():
-            change = state.memory.get("contact_change", 0.0)
-            ends = links.two.gather(np.concatenate([state.contact + change, state.position], axis=1))
+            ends = links.two.gather(np.concatenate([total, state.position], axis=1))
             force = 0.5 * links.two.apart(ends[:, :, :3])  # half the relative force between the ends
             force[force <= _NONE * links.force] = 0.0
             self._push = self._pressed & self._treated, force, links.two.apart(ends[:, :, 3:])
@@ -250,33 +252,33 @@ class Restitution(Treatment):
         links, state = self.stepper.model.links, self.stepper.state
         if not links.rows.rebounds:
             return np.zeros(len(fresh))
-        every, two = np.arange(len(state.v)), links.two
-        moved = state.position - self._place
-        if self.stepper.scheme.explicit:
-            vectors = moved, *self._explicit_motion(every, moved)
-        else:
-            vectors = moved, self._speed, self._free + self._without_contact(every)
-        ends = two.gather(np.concatenate(vectors, axis=1))
-        towards = [-two.apart(ends[:, :, k : k + 3]) for k in range(0, ends.shape[2], 3)]
-        distance, restitution = np.maximum(towards[0], 0.0), links.rows.restitution
-        if self.stepper.scheme.explicit:
-            _, approach, before, after = towards
-            square = impact_square(approach, distance, before)
-            leaves = rebound_way(restitution, square, distance, after) / self.stepper.part
-        else:
-            _, speed, pull = towards
-            leaves = np.where(speed > 0.0, restitution * np.sqrt(np.maximum(speed * speed + pull * distance, 0.0)), 0.0)
-        return np.where(fresh, leaves, 0.0)
+        two, moved = links.two, state.position - self._place
+        ends = two.gather(np.hstack([moved, *self._free_motion(np.arange(len(moved)), moved)]))
+        closing, *towards = (-two.apart(ends[:, :, k : k + 3]) for k in range(0, ends.shape[2], 3))
+        return np.where(fresh, self._rebound(links.rows.restitution, np.maximum(closing, 0.0), *towards), 0.0)
 
-    def _explicit_motion(self, nodes: np.ndarray, moved: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return displacements of nodes (m,) without contact (m, 3), which have ``moved`` by (m, 3) with it, and their
-        parts by forces before and after the impact [m]; from the balance of the step."""
+    def _free_motion(self, nodes: np.ndarray, moved: np.ndarray) -> tuple[np.ndarray, ...]:
+        """Return the motion without contact of nodes (m,), which have ``moved`` by (m, 3) with it: in explicit steps
+        their displacements (m, 3), and the parts of these by forces before and after the impact [m], from the balance
+        of the step; in others velocities before it, and twice their mean accelerations."""
         stepper, state, h = self.stepper, self.stepper.state, self.stepper.part
+        if not stepper.scheme.explicit:
+            return self._speed[nodes], self._free[nodes] + self._without_contact(nodes)
         balance, mass = stepper.balance, stepper.model.inertia.mass[nodes, None]
         push = np.where(stepper.model.supports.fixed[nodes], 0.0, state.contact[nodes]) / mass
         known = 0.0 if balance.a_hat is None else balance.a_hat[nodes]
         free = balance.alpha * stepper.solution.u[nodes] + known - push
         return moved - push / balance.alpha, h * h * free, h * h * self._without_contact(nodes)
+
+    def _rebound(self, restitution: np.ndarray, distance: np.ndarray, *towards: np.ndarray) -> np.ndarray:
+        """Return the velocities at which nodes leave what they have met after a distance [m]; ``towards``: the parts of
+        :meth:`_free_motion` towards it."""
+        if self.stepper.scheme.explicit:
+            approach, before, after = towards
+            square = impact_square(approach, distance, before)
+            return rebound_way(restitution, square, distance, after) / self.stepper.part
+        speed, pull = towards
+        return np.where(speed > 0.0, restitution * np.sqrt(np.maximum(speed * speed + pull * distance, 0.0)), 0.0)
 
     def put(self, nodes: np.ndarray, v: np.ndarray, a: np.ndarray) -> None:
         """Set velocities and accelerations (m, 3) of nodes (m,) in contact and of those just released."""
@@ -317,38 +319,21 @@ class Restitution(Treatment):
         contact = self.stepper.model.contact
         if not contact.restitution.any():
             return np.zeros(touching.shape)
-        distance = np.maximum(-np.einsum("mwi,mwi->mw", normals, self._moved(nodes)), 0.0)
-        fresh = touching & ~self._touched[nodes]
-        if self.stepper.scheme.explicit:
-            return np.where(fresh, self._explicit_rebound(nodes, distance, normals), 0.0)
-        speed = np.einsum("mwi,mwi->mw", normals, self._speed[nodes][:, None, :] - rates)
-        towards = -np.einsum("mwi,mi->mw", normals, self._free[nodes] + self._without_contact(nodes))
-        impact = np.sqrt(np.maximum(speed * speed + towards * distance, 0.0))
-        return np.where(fresh & (speed < 0.0), contact.restitution * impact, 0.0)
-
-    def _explicit_rebound(self, nodes: np.ndarray, distance: np.ndarray, normals: np.ndarray) -> np.ndarray:
-        """Return velocities (m, w) at which nodes leave walls hit after a distance (m, w); see :meth:`leaving`.
-
-        The displacements without walls follow from the balance of the step.
-        """
-        contact, state = self.stepper.model.contact, self.stepper.state
-        way = self._carried(nodes, state.time)
-        moved, before, after = self._explicit_motion(nodes, state.position[nodes] - self._place[nodes])
-        approach, before, after = (
-            -np.einsum("mwi,mwi->mw", normals, array)
-            for array in (moved[:, None, :] - way, before[:, None, :], after[:, None, :])
-        )
-        square = impact_square(approach, distance, before)
-        return rebound_way(contact.restitution, square, distance, after) / self.stepper.part
+        state = self.stepper.state
+        moved = state.position[nodes] - self._place[nodes]
+        carried = self._carried(nodes, state.time)
+        first, *others = (each[:, None, :] for each in self._free_motion(nodes, moved))
+        vectors = moved[:, None, :] - carried, first - (carried if self.stepper.scheme.explicit else rates), *others
+        closing, *towards = (-np.einsum("mwi,mwi->mw", normals, each) for each in vectors)
+        leaves = self._rebound(contact.restitution, np.maximum(closing, 0.0), *towards)
+        return np.where(touching & ~self._touched[nodes], leaves, 0.0)
 
     def sticking(self, nodes: np.ndarray, touching: np.ndarray, normals: np.ndarray) -> np.ndarray:
         """See :class:`~pfem_petsc.contact.treatments.base.Treatment`."""
         model = self.stepper.model
         if not model.contact.has_friction:
             return np.zeros(touching.shape, dtype=bool)
-        slip = self._moved(nodes)
-        slip -= np.einsum("mwi,mwi->mw", slip, normals)[:, :, None] * normals
-        still = np.linalg.norm(slip, axis=2) <= STILL * model.size
+        still = np.linalg.norm(across(self._moved(nodes), normals), axis=2) <= STILL * model.size
         return touching & still & (model.contact.static_friction > 0.0)
 
     def _moved(self, nodes: np.ndarray) -> np.ndarray:
@@ -360,8 +345,7 @@ class Restitution(Treatment):
         """Return how far walls carry their points at nodes (m,) from the start of the step to a time [s], (m, slots, 3)
         [m]."""
         contact = self.stepper.model.contact
-        poses = contact.motion.poses(self._time), contact.motion.poses(time)
-        return contact.ways(self._place[nodes], *poses)
+        return contact.ways(self._place[nodes], contact.motion.poses(self._time), contact.motion.poses(time))
 
     def on_walls(self, applicable: np.ndarray | bool = True) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return nodes in contact with walls (m,), and their new velocities and accelerations (m, 3) [m/s], [m/s2]."""
@@ -372,12 +356,8 @@ class Restitution(Treatment):
         a = a - np.einsum("mij,mj->mi", normal, a)
         if not model.contact.restitution.any():
             return nodes, v, a
-        touching = np.zeros_like(self._touched)
-        touching[self.stepper.solution.walls.nodes] = self.stepper.solution.walls.touching
-        closed = touching & ~self._touched & (model.contact.restitution > 0.0)
-        leaves = closed[nodes].any(axis=1)
-        if leaves.any():
-            a[leaves] += np.einsum("mij,mj->mi", normal[leaves], self._without_contact(nodes[leaves]))
+        leaves = (self.stepper.touching & ~self._touched & (model.contact.restitution > 0.0))[nodes].any(axis=1)
+        a[leaves] += np.einsum("mij,mj->mi", normal[leaves], self._without_contact(nodes[leaves]))
         return nodes, v, a
 
     def _pairs_let_go(self) -> tuple[np.ndarray, np.ndarray]:

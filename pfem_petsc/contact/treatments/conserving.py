@@ -63,8 +63,7 @@ class Treatment(Base):
     def _accelerations(self, nodes: np.ndarray, normal: np.ndarray) -> np.ndarray:
         """Return accelerations (m, 3), without contact along the range of projections (m, 3, 3)."""
         state = self.stepper.state
-        force = (state.external - state.f[: len(state.a)])[nodes]
-        free = force / self.stepper.model.inertia.mass[nodes, None]
+        free = (state.external - state.f[: len(state.a)])[nodes] / self.stepper.model.inertia.mass[nodes, None]
         free = np.where(self.stepper.model.supports.fixed[nodes], state.a[nodes], free)
         return state.a[nodes] + np.einsum("mij,mj->mi", normal, free - state.a[nodes])
 

@@ -16,16 +16,24 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
+from mpi4py import MPI
 
 from ...errors import InputError
 from ...integrators.base import Scheme
 from ...parallel.agreement import agreed
-from ...tolerances import FREE_PART
+from ...tolerances import FREE_PART, ON_BOUND, ROUNDING
+from ..node_walls import WallForces
 from .base import Treatment as Base
 
 if TYPE_CHECKING:
     from ...stepping.model import Model
-    from ..contact import Contact
+
+
+_ITERATIONS = 200
+_CALMER, _BOLDER = 0.7, 1.3  # factors that shorten moves while they oscillate, and lengthen them up to full moves
+_FARTHEST = 0.25  # longest single move, relative to the shortest bar of the node
+_STEEPEST = 0.05  # minimum squared cosine between bars and the normal in the stiffness
+_SOFTEST = 1e-4  # smallest accepted ratio between secant and elastic stiffness, either way; below it is rounding
 
 
 @dataclass(frozen=True)
@@ -56,6 +64,10 @@ class Redistribution:
         """Add the product of the tensors with vectors ``u`` (owned, 3), times a factor."""
         out[self.touched] += factor * np.einsum("kij,kj->ki", self.tensors, u[self.touched])
 
+    def massless(self, model: Model) -> MasslessNodes:
+        """Return the nodes without mass of a model."""
+        return MasslessNodes(model)
+
 
 def redistribute(model: Model) -> Redistribution:
     """Compute the redistributed masses. Collective.
@@ -67,8 +79,7 @@ def redistribute(model: Model) -> Redistribution:
         neighbours.
     """
     contact, mesh, inertia = model.contact, model.mesh, model.inertia
-    source = model.case.source
-    key = f'{source}: contact.treatment = "mass_redistribution"'
+    key = f'{model.case.source}: contact.treatment = "mass_redistribution"'
     for k, wall in enumerate(contact.walls):
         if not wall.flat or wall.partial or contact.motion.turning[k] or contact.all_nodes[k]:
             raise InputError(
@@ -88,25 +99,25 @@ def redistribute(model: Model) -> Redistribution:
         if applies:
             raise InputError(f"{key}: {text}")
     owned = mesh.n_owned
-    members = contact.members
     with agreed(mesh.comm):
-        several = np.flatnonzero(members.sum(axis=1) > 1)
+        several = np.flatnonzero(contact.members.sum(axis=1) > 1)
         if len(several):
             raise InputError(f"{key}: node {mesh.node_ids[several[0]]} belongs to several walls; give it one")
     # normal, mass and sum of weights of contact nodes, known to all ranks that see them
     info = np.zeros((mesh.n_local, 5))
-    nodes, walls, free, across = _movable(contact)
-    info[nodes, :3] = free
-    info[nodes, 3] = inertia.mass[nodes]
+    nodes = np.flatnonzero(contact.members.any(axis=1))
+    walls = contact.members[nodes].argmax(axis=1)
+    free = np.where(contact.fixed[nodes], 0.0, contact.surfaces.normals[walls])
+    across = np.sqrt((free * free).sum(axis=1))
+    can = across**2 > FREE_PART  # move off their walls
+    nodes, walls, free, across = nodes[can], walls[can], free[can] / across[can, None], across[can]
+    info[nodes, :3], info[nodes, 3] = free, inertia.mass[nodes]
     mesh.update_ghosts(info)
-    is_contact = info[:, 3] > 0.0
-    a, b = mesh.bars.T
-    weights = []
-    for here, there in ((a, b), (b, a)):
-        way = mesh.points[there] - mesh.points[here]
-        squared = np.einsum("bi,bi->b", way, info[here, :3]) ** 2 / (way * way).sum(axis=1)
-        weights.append(np.where(is_contact[here] & ~is_contact[there], squared, 0.0))
-        np.add.at(info[:, 4], here, weights[-1])
+    here, there = np.hstack([mesh.bars.T, mesh.bars.T[::-1]])  # of each bar in both directions
+    way = mesh.points[there] - mesh.points[here]
+    weight = np.einsum("bi,bi->b", way, info[here, :3]) ** 2 / (way * way).sum(axis=1)
+    weight[~((info[here, 3] > 0.0) & (info[there, 3] <= 0.0))] = 0.0
+    np.add.at(info[:, 4], here, weight)
     mesh.update_ghosts(info)
     with agreed(mesh.comm):
         lone = nodes[info[nodes, 4] <= 1e-6]
@@ -118,11 +129,9 @@ def redistribute(model: Model) -> Redistribution:
     tensors = np.zeros((owned, 3, 3))
     normals = info[:, :3]
     tensors[nodes] -= info[nodes, 3, None, None] * normals[nodes, :, None] * normals[nodes, None, :]
-    for (here, there), weight in zip(((a, b), (b, a)), weights, strict=True):
-        give = np.flatnonzero((weight > 0.0) & (there < owned))
-        share = weight[give] / info[here[give], 4] * info[here[give], 3]
-        n = normals[here[give]]
-        np.add.at(tensors, there[give], share[:, None, None] * n[:, :, None] * n[:, None, :])
+    give = np.flatnonzero((weight > 0.0) & (there < owned))
+    share, n = weight[give] / info[here[give], 4] * info[here[give], 3], normals[here[give]]
+    np.add.at(tensors, there[give], share[:, None, None] * n[:, :, None] * n[:, None, :])
     touched = np.flatnonzero(np.abs(tensors).max(axis=(1, 2), initial=0.0) > 0.0)
     movable = ~model.supports.fixed[touched]
     matrices = inertia.mass[touched, None, None] * np.eye(3) + tensors[touched]
@@ -131,17 +140,92 @@ def redistribute(model: Model) -> Redistribution:
     return Redistribution(nodes, walls, free, across, touched, tensors[touched], inverses)
 
 
-def _movable(contact: Contact) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Return owned nodes (m,) that can move off their walls (m,), the unit vectors (m, 3), and ``across`` (m,)."""
-    nodes = np.flatnonzero(contact.members.any(axis=1))
-    walls = contact.members[nodes].argmax(axis=1)
-    normals = contact.normals[walls]
-    free = np.where(contact.fixed[nodes], 0.0, normals)
-    # a fully free normal is not rescaled, which would change its last digits
-    free = np.where(contact.fixed[nodes].any(axis=1)[:, None], free, normals)
-    across = np.sqrt((free * free).sum(axis=1))
-    can = across**2 > FREE_PART
-    return nodes[can], walls[can], free[can] / across[can, None], across[can]
+class MasslessNodes:
+    """Contact nodes without mass along the normals of their walls: in equilibrium, or on the wall."""
+
+    def __init__(self, model: Model) -> None:
+        self.model = model
+        self.moved = model.inertia.redistribution
+        self._force = np.zeros((model.mesh.n_local, 3))
+
+    def settle(self, x: np.ndarray, time: float, now: float) -> float:
+        """Move nodes of ``x`` (local, 3), in place, along their normals into equilibrium or onto the wall.
+
+        Forces, walls and bars are those of ``time``; afterwards bars are reset to ``now`` [s]. Returns
+        the largest of the last moves, which is rounding of the model's length unless no equilibrium was found.
+        Collective.
+        """
+        model, moved = self.model, self.moved
+        owned, nodes, n = model.mesh.n_owned, moved.nodes, moved.normals
+        external = np.zeros((owned, 3))
+        if model.external.active:
+            model.external.at(time, external)
+        model.change_bars(time)
+        model.mesh.update_ghosts(x)  # a scheme predicts owned nodes alone
+        elastic, farthest = self._stiffness(x)
+        stiffness, force, step = elastic, np.full(len(nodes), np.nan), np.zeros(len(nodes))
+        part, largest = np.ones(len(nodes)), 0.0
+        for _ in range(_ITERATIONS):
+            gap = self.gaps(x[:owned], time)
+            x[nodes] -= np.minimum(gap, 0.0)[:, None] * n
+            model.mesh.update_ghosts(x)
+            model.bars.forces(x, self._force, commit=False)
+            last, force = force, np.einsum("mi,mi->m", external[nodes] - self._force[nodes], n)
+            with np.errstate(invalid="ignore", divide="ignore"):
+                secant = (last - force) / step
+            # where bars yield or rotate, the elastic stiffness would need hundreds of moves
+            stiffness = np.where((secant > _SOFTEST * elastic) & (secant < elastic / _SOFTEST), secant, elastic)
+            swings = step * force < 0.0  # massless neighbours may push each other back and forth
+            part = np.where(swings, _CALMER * part, np.minimum(_BOLDER * part, 1.0))
+            step = np.maximum(np.clip(part * force / stiffness, -farthest, farthest), -np.maximum(gap, 0.0))
+            x[nodes] += step[:, None] * n
+            # with a bar perpendicular to the normal, forces within rounding may leave the position undetermined
+            open_way = np.minimum(np.abs(step), np.abs(force) / elastic)
+            largest = model.comm.allreduce(float(open_way.max(initial=0.0)), op=MPI.MAX)
+            if largest <= ROUNDING * model.size:
+                break
+        model.mesh.update_ghosts(x)
+        model.change_bars(now)
+        return largest
+
+    def gaps(self, x: np.ndarray, time: float) -> np.ndarray:
+        """Return the distances (m,) of the nodes from the wall along their vectors [m]."""
+        gaps = self.model.contact.gaps(x[self.moved.nodes], time, self.moved.nodes)
+        return gaps[np.arange(len(gaps)), self.model.contact.wall_of[self.moved.walls]] / self.moved.across
+
+    def press(self, x: np.ndarray, load: np.ndarray, time: float) -> tuple[np.ndarray, WallForces]:
+        """Return wall forces (owned, 3) that balance a load on nodes at x (owned, 3), and their sums.
+
+        The residual force on a massless node in equilibrium is the force of its wall.
+        """
+        moved, contact = self.moved, self.model.contact
+        n, nodes = moved.normals, moved.nodes
+        strength = -np.einsum("mi,mi->m", load[nodes], n)
+        touching = self.gaps(x, time) <= ON_BOUND * self.model.size
+        strength = np.where(touching, np.maximum(strength, 0.0), 0.0) / moved.across
+        force, touched = np.zeros_like(load), np.zeros((len(nodes), len(contact.wall_of)), dtype=bool)
+        touched[np.arange(len(nodes)), moved.walls] = strength > 0.0
+        each = touched[:, :, None] * (strength[:, None] * contact.surfaces.normals[moved.walls])[:, None, :]
+        force[nodes] = each.sum(axis=1)
+        return force, contact.sums(nodes, each, (x[nodes], x[nodes]), touched)
+
+    def _stiffness(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return stiffness (m,) of nodes along their normals at fixed neighbours [N/m], and their longest moves [m].
+
+        A bar perpendicular to the normal has geometric stiffness only, so a minimum inclination is assumed.
+        """
+        mesh, model = self.model.mesh, self.model
+        total, shortest = np.zeros(mesh.n_local), np.full(mesh.n_local, np.inf)
+        normal = np.zeros((mesh.n_local, 3))
+        normal[self.moved.nodes] = self.moved.normals
+        way = x[mesh.bars[:, 1]] - x[mesh.bars[:, 0]]
+        length = np.linalg.norm(way, axis=1)
+        stiffness = model.bars.of_blocks(lambda block: block.area * block.modulus) / model.bars.rest
+        for end in mesh.bars.T:
+            along = np.einsum("bi,bi->b", way, normal[end]) / length
+            np.add.at(total, end, stiffness * np.maximum(along * along, _STEEPEST))
+            np.minimum.at(shortest, end, model.bars.rest)
+        return total[self.moved.nodes], _FARTHEST * shortest[self.moved.nodes]
 
 
 class Treatment(Base):
@@ -185,5 +269,4 @@ class Treatment(Base):
         stepper.scheme.restart(state, nodes, stepper.part)
         # along the normals alone, where there is no momentum that jumps
         for name, kept in memory.items():
-            change = np.einsum("mi,mi->m", state.memory[name][nodes] - kept, n)
-            state.memory[name][nodes] = kept + change[:, None] * n
+            state.memory[name][nodes] = kept + np.einsum("mi,mi->m", state.memory[name][nodes] - kept, n)[:, None] * n

@@ -20,7 +20,7 @@ import numpy as np
 
 from ...integrators.base import State
 from ...tolerances import FREE_PART, RANK
-from .base import STILL, Restitution
+from .base import STILL, Restitution, across
 
 _TINY = 1e-200  # divides what is nothing
 
@@ -59,14 +59,11 @@ class Treatment(Restitution):
         if not contact.has_friction or stepper.scheme.solves_next_position or len(nodes) == 0:
             return v, a, 0.0
         touching = stepper.touching[nodes]
-        poses = contact.motion.poses(state.time)
-        normals, _ = contact.planes(touching, state.position[nodes], poses, nodes=nodes)
-        slip = self._moved(nodes)
+        normals, _ = contact.planes(touching, state.position[nodes], contact.motion.poses(state.time), nodes=nodes)
+        slip = across(self._moved(nodes), normals)
         if not stepper.scheme.solves_end:  # friction acts along the slip to the position solved for, if any
-            solved = self._moved_to_solution(nodes)
-            solved -= np.einsum("mwi,mwi->mw", solved, normals)[:, :, None] * normals
+            solved = across(self._moved_to_solution(nodes), normals)
             slip = np.where(np.linalg.norm(solved, axis=2)[:, :, None] > STILL * stepper.model.size, solved, slip)
-        slip -= np.einsum("mwi,mwi->mw", slip, normals)[:, :, None] * normals
         size = np.linalg.norm(slip, axis=2)
         slips = touching & (size > STILL * stepper.model.size) & (contact.friction > 0.0)
         slips[self.sticking(nodes, touching, normals).any(axis=1)] = False

@@ -3,13 +3,24 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import Field, field_validator, model_validator
+from pydantic import AfterValidator, Field, field_validator, model_validator
 
-from ...case.base import Finite, Inertia, PositiveFloat, StrictModel, SurfaceKeys, Vector3, WallParameters, listed
+from ...case.base import (
+    Finite,
+    Inertia,
+    PositiveFloat,
+    StrictModel,
+    SurfaceKeys,
+    Table2,
+    Table4,
+    Vector3,
+    WallParameters,
+)
 from ...errors import InputError, raised
 from ...registry import added_file, lookup
 from ..plugins import checked
@@ -20,18 +31,31 @@ WALLS = "pfem_petsc.contact.walls"
 _ALIKE = 1e-6
 """Relative difference up to which numbers of a file count as equal."""
 
-Row2 = Annotated[tuple[Finite, Finite], listed]
-Row4 = Annotated[tuple[Finite, Finite, Finite, Finite], listed]
+_DEEP = 0.125
+"""Depth of bars in a body, as a fraction of its width, beyond which they are reported."""
+_SAMPLES = 9
+"""Places along a bar at which the least distance is looked for first."""
+_GOLDEN = 0.5 * (np.sqrt(5.0) - 1.0)
+_ROUNDS = 30
+"""Of the search by golden sections, each of which leaves 0.62 of the interval."""
+_AT_END = 1e-7
+"""Part of the length next to an end of a bar, where walls stop the node."""
 
 
-def increasing(rows: tuple | None) -> tuple | None:
-    """Check that the times of rows [t, ...] increase; return them."""
-    if rows is not None and not rows:
-        raise ValueError("expected at least one row")
-    for k in range(1, len(rows or ())):
-        if rows[k][0] <= rows[k - 1][0]:
-            raise ValueError(f"times must increase, but row {k} has t = {rows[k][0]!r} after {rows[k - 1][0]!r}")
-    return rows
+def has_length(value: tuple[float, float, float], what: str) -> tuple[float, float, float]:
+    """Check that a vector has nonzero length; return it."""
+    largest = max(map(abs, value))
+    if not largest > 0.0:
+        raise ValueError(f"has zero length; give {what}")
+    if not 1e-100 < largest < 1e100:
+        # the squares of its components would overflow or vanish
+        raise ValueError(f"has components out of range (1e-100 to 1e100); give {what} as a vector of about length 1")
+    return value
+
+
+def direction(what: str) -> AfterValidator:
+    """Annotation of a vector that gives a direction, which messages call ``what``."""
+    return AfterValidator(lambda value: has_length(value, what))
 
 
 class Hinge(StrictModel):
@@ -45,7 +69,7 @@ class Hinge(StrictModel):
     @field_validator("axis")
     @classmethod
     def _has_length(cls, value: tuple[float, float, float]) -> tuple[float, float, float]:
-        return direction(value, f"the direction of the axis of the {cls.__name__.lower()}")
+        return has_length(value, f"the direction of the axis of the {cls.__name__.lower()}")
 
 
 class Rotation(Hinge):
@@ -55,15 +79,10 @@ class Rotation(Hinge):
 
     angular_velocity: Finite | None = None
     """constant angular velocity [rad/s], by the right-hand rule"""
-    angles: Annotated[tuple[Row2, ...], listed] | None = None
+    angles: Table2 | None = None
     """rows [t, angle]: rotation from rest [s, rad], at rest before the first and after the last"""
     interpolation: Literal["smooth", "linear"] = "smooth"
     """interpolation of ``angles`` between its rows: a cubic spline, or straight lines with velocity jumps at rows"""
-
-    @field_validator("angles")
-    @classmethod
-    def _times_increase(cls, rows: tuple | None) -> tuple | None:
-        return increasing(rows)
 
 
 class WallKeys(SurfaceKeys, WallParameters):
@@ -87,7 +106,7 @@ class WallKeys(SurfaceKeys, WallParameters):
     """axis about which alone a wall with inertia turns"""
     gravity: bool = False
     """true: gravity acts on a wall with mass, as on the truss"""
-    motion: Annotated[tuple[Row4, ...], listed] | None = None
+    motion: Table4 | None = None
     """rows [t, dx, dy, dz]: displacement of the wall [s, m], at rest before the first and after the last"""
     motion_file: Annotated[str, Field(min_length=1)] | None = None
     """the rows of ``motion`` from the columns of a CSV or NPZ file: its name, or a table"""
@@ -99,52 +118,58 @@ class WallKeys(SurfaceKeys, WallParameters):
     tied: bool = False
     """true: a node that touches the wall is fixed to it from then on, in all directions"""
 
-    @field_validator("motion")
-    @classmethod
-    def _times_increase(cls, rows: tuple | None) -> tuple | None:
-        return increasing(rows)
-
     @model_validator(mode="after")
     def _moves_one_way(self) -> WallKeys:
-        if self.velocity is not None and self.motion is not None:
-            raise ValueError("expected at most one of the keys velocity, motion")
-        if self.interpolation == "linear" and self.motion is None:
-            raise ValueError('interpolation = "linear" requires motion')
-        if self.gravity and self.mass is None:
-            raise ValueError("gravity = true needs the wall's mass [kg]")
-        if self.mass is not None and self.motion is not None:
-            raise ValueError("expected at most one of the keys mass, motion")
-        self._turns_one_way()
+        turning = [key for key in ("centre_of_mass", "angular_velocity", "hinge") if getattr(self, key) is not None]
+        for wrong, text in (
+            (
+                self.velocity is not None and self.motion is not None,
+                "expected at most one of the keys velocity, motion",
+            ),
+            (self.interpolation == "linear" and self.motion is None, 'interpolation = "linear" requires motion'),
+            (self.gravity and self.mass is None, "gravity = true needs the wall's mass [kg]"),
+            (self.mass is not None and self.motion is not None, "expected at most one of the keys mass, motion"),
+            (
+                turning and self.inertia is None,
+                f"{''.join(turning[:1])} is that of a wall with inertia [kg m2], which this wall has not",
+            ),
+            (self.inertia is not None and self.mass is None, "inertia needs the wall's mass [kg]"),
+            (
+                self.inertia is not None and self.rotation is not None,
+                "expected at most one of the keys inertia, rotation",
+            ),
+        ):
+            if wrong:
+                raise ValueError(text)
+        if self.inertia is not None:
+            self._check_inertia()
         if self.tied and (self.friction or self.static_friction or self.restitution):
             raise ValueError("a tied wall cannot have friction or restitution: nodes neither slip nor leave")
         return self
 
-    def _turns_one_way(self) -> None:
-        if self.inertia is None:
-            for key in ("centre_of_mass", "angular_velocity", "hinge"):
-                if getattr(self, key) is not None:
-                    raise ValueError(f"{key} is that of a wall with inertia [kg m2], which this wall has not")
-            return
-        if self.mass is None:
-            raise ValueError("inertia needs the wall's mass [kg]")
-        if self.rotation is not None:
-            raise ValueError("expected at most one of the keys inertia, rotation")
+    def _check_inertia(self) -> None:
         tensor = self.tensor
         moments = np.linalg.eigvalsh(tensor)
-        if np.abs(tensor - tensor.T).max() > _ALIKE * np.abs(tensor).max():
-            raise ValueError(f"inertia is not symmetric: {tensor.tolist()}")
-        if moments[0] <= 0.0 or moments[2] > (1.0 + _ALIKE) * (moments[0] + moments[1]):
-            raise ValueError(
+        hinge = self.hinge and self.hinge.axis
+        spin, axis = (np.array(each or (0.0, 0.0, 0.0)) for each in (self.angular_velocity, hinge))
+        for wrong, text in (
+            (
+                np.abs(tensor - tensor.T).max() > _ALIKE * np.abs(tensor).max(),
+                f"inertia is not symmetric: {tensor.tolist()}",
+            ),
+            (
+                moments[0] <= 0.0 or moments[2] > (1.0 + _ALIKE) * (moments[0] + moments[1]),
                 f"inertia has the principal moments {', '.join(f'{moment:.4g}' for moment in moments)} kg m2, which no "
-                "body has: they must be positive, and none larger than the sum of the others"
-            )
-        if self.hinge is None:
-            return
-        if self.velocity is not None:
-            raise ValueError("expected at most one of the keys hinge, velocity")
-        spin, axis = (np.array(each or (0.0, 0.0, 0.0)) for each in (self.angular_velocity, self.hinge.axis))
-        if np.linalg.norm(np.cross(spin, axis)) > _ALIKE * np.linalg.norm(spin) * np.linalg.norm(axis):
-            raise ValueError("angular_velocity must be along the axis of the hinge")
+                "body has: they must be positive, and none larger than the sum of the others",
+            ),
+            (self.hinge is not None and self.velocity is not None, "expected at most one of the keys hinge, velocity"),
+            (
+                np.linalg.norm(np.cross(spin, axis)) > _ALIKE * np.linalg.norm(spin) * np.linalg.norm(axis),
+                "angular_velocity must be along the axis of the hinge",
+            ),
+        ):
+            if wrong:
+                raise ValueError(text)
 
     @property
     def tensor(self) -> np.ndarray:
@@ -161,6 +186,7 @@ class BaseWall(ABC):
     ----------
     flat : whether the tangent plane is the same everywhere; then ``normal`` (3,) and ``offset`` [m] are that plane
     partial : whether nodes can pass beside it, so that their previous positions matter (:meth:`stops`)
+    closed : whether bars can be deep in it, rather than cross it
     faces : how many planes a node can touch at once; more than one for a surface of triangles
     width : smallest extent [m] of a wall that bars can cross between their nodes, infinite for others
     centre : (3,) [m], the point whose position is recorded if the wall moves
@@ -168,6 +194,7 @@ class BaseWall(ABC):
 
     flat = False
     partial = False
+    closed = True
     faces = 1
     width = np.inf
     centre: np.ndarray
@@ -189,6 +216,44 @@ class BaseWall(ABC):
     def stops(self, before: np.ndarray, x: np.ndarray, tolerance: float) -> np.ndarray:
         """Return (m,) bool: nodes that the wall stops between ``before`` (m, 3) and ``x`` (m, 3); for partial walls."""
         return np.ones(len(x), dtype=bool)
+
+    def crossed(self, starts: np.ndarray, ends: np.ndarray) -> np.ndarray:
+        """Return (m,) bool: bars from ``starts`` to ``ends`` (m, 3) that intersect a wall of finite width."""
+        return deepest(self.gaps, np.stack([starts, ends], axis=1))[1] < -_DEEP * self.width
+
+
+def deepest(gaps_of: Callable[[np.ndarray], np.ndarray], ends: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return where between their ends (m, 2, 3) bars are deepest beyond a wall, from 0 to 1, and the distances there
+    (m,) [m]; infinite where that is at an end, which walls stop as a node, and of bars that are far from it.
+
+    ``gaps_of``: see :meth:`BaseWall.gaps`
+    """
+
+    def gap(t: np.ndarray) -> np.ndarray:
+        return gaps_of((1.0 - t)[:, None] * ends[:, 0] + t[:, None] * ends[:, 1])
+
+    where, least = np.zeros(len(ends)), np.full(len(ends), np.inf)
+    # the distance changes along a bar by no more than the way
+    near = np.flatnonzero(gap(where + 0.5) <= 0.5 * np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1))
+    if not len(near):
+        return where, least
+    ends, places = ends[near], np.linspace(0.0, 1.0, _SAMPLES)
+    best = np.stack([gap(np.full(len(ends), t)) for t in places]).argmin(axis=0)
+    low, high = places[np.maximum(best - 1, 0)], places[np.minimum(best + 1, _SAMPLES - 1)]
+    one, two = high - _GOLDEN * (high - low), low + _GOLDEN * (high - low)
+    first, second = gap(one), gap(two)
+    for _ in range(_ROUNDS):
+        left = first < second
+        low, high = np.where(left, low, one), np.where(left, two, high)
+        one, two = (
+            np.where(left, high - _GOLDEN * (high - low), two),
+            np.where(left, one, low + _GOLDEN * (high - low)),
+        )
+        fresh = gap(np.where(left, one, two))
+        first, second = np.where(left, fresh, second), np.where(left, first, fresh)
+    t = 0.5 * (low + high)
+    where[near], least[near] = t, np.where((t > _AT_END) & (t < 1.0 - _AT_END), gap(t), np.inf)
+    return where, least
 
 
 class RoundWall(BaseWall):
@@ -219,8 +284,7 @@ class RoundWall(BaseWall):
         arm, length = self._arms(x)
         far = length[:, None] > 1e-12 * self.radius
         normals = np.where(far, arm / np.maximum(length, 1e-300)[:, None], self.across)
-        offsets = self.sign * (np.einsum("ij,ij->i", normals, x - arm) + self.radius)
-        return self.sign * normals, offsets
+        return self.sign * normals, self.sign * (np.einsum("ij,ij->i", normals, x - arm) + self.radius)
 
     def gaps(self, x: np.ndarray) -> np.ndarray:
         return self.sign * (self._arms(x)[1] - self.radius)
@@ -254,7 +318,9 @@ def _flaw(wall: BaseWall, x: np.ndarray) -> str:
     """Return how a wall differs from what :class:`BaseWall` says, empty if it does not."""
     if np.shape(wall.centre) != (3,):
         return f"its centre is {wall.centre!r:.80}; it must be an array (3,)"
-    if wall.flat and not _is_plane(wall.normal, wall.offset):
+    if wall.flat and not (
+        np.shape(wall.normal) == (3,) and abs(np.linalg.norm(wall.normal) - 1.0) < 1e-6 and np.isfinite(wall.offset)
+    ):
         return f"its normal is {wall.normal!r:.80} and its offset {wall.offset!r:.80}; give a unit vector and a number"
     must = "it must return unit normals (m, 3) and offsets (m,) for positions (m, 3)"
     planes = wall.planes(x)
@@ -268,21 +334,6 @@ def _flaw(wall: BaseWall, x: np.ndarray) -> str:
         found = f"the normal {normals[at].tolist()} and the offset {offsets[at]} at {x[at].tolist()}"
         return f"planes returned {found}; {must}"
     return ""
-
-
-def _is_plane(normal: Any, offset: Any) -> bool:
-    return np.shape(normal) == (3,) and abs(np.linalg.norm(normal) - 1.0) < 1e-6 and bool(np.isfinite(offset))
-
-
-def direction(value: tuple[float, float, float], what: str) -> tuple[float, float, float]:
-    """Check that a vector has nonzero length; return it."""
-    largest = max(map(abs, value))
-    if not largest > 0.0:
-        raise ValueError(f"has zero length; give {what}")
-    if not 1e-100 < largest < 1e100:
-        # the squares of its components would overflow or vanish
-        raise ValueError(f"has components out of range (1e-100 to 1e100); give {what} as a vector of about length 1")
-    return value
 
 
 @dataclass(frozen=True)

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Annotated, Literal
 
 import numpy as np
-from pydantic import field_validator
 
 from ...case.base import PositiveFloat, Vector3
 from .base import RoundWall, Surface, WallKeys, direction, perpendicular, revolved
@@ -16,17 +15,12 @@ class Parameters(WallKeys):
 
     point: Vector3
     """Any point of the axis [m]."""
-    axis: Vector3
+    axis: Annotated[Vector3, direction("the direction of the axis")]
     """Direction of the axis, of any nonzero length."""
     radius: PositiveFloat
     """Radius [m]."""
     side: Literal["outside", "inside"] = "outside"
     """where nodes may be"""
-
-    @field_validator("axis")
-    @classmethod
-    def _has_length(cls, value: tuple[float, float, float]) -> tuple[float, float, float]:
-        return direction(value, "the direction of the axis")
 
 
 class Wall(RoundWall):

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from typing import Annotated
+
 import numpy as np
-from pydantic import field_validator
 
 from ...case.base import Vector3
 from .base import BaseWall, WallKeys, direction
@@ -14,13 +15,8 @@ class Parameters(WallKeys):
 
     point: Vector3
     """Any point of the plane [m]."""
-    normal: Vector3
+    normal: Annotated[Vector3, direction("the direction of the allowed side")]
     """Points to the allowed side, of any nonzero length."""
-
-    @field_validator("normal")
-    @classmethod
-    def _has_length(cls, value: tuple[float, float, float]) -> tuple[float, float, float]:
-        return direction(value, "the direction of the allowed side")
 
 
 class Wall(BaseWall):

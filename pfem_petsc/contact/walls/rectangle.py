@@ -11,13 +11,15 @@ from ...case.base import PositiveFloat, Vector3, listed
 from .base import Surface, WallKeys, direction, slab
 from .plane import Wall as Plane
 
+_SLACK = 1e-6  # distance of both ends from the plane, over their length, beyond which bars cross it
+
 
 class Parameters(WallKeys):
     """Keys of a rectangular wall."""
 
     point: Vector3
     """Centre of the rectangle [m]."""
-    normal: Vector3
+    normal: Annotated[Vector3, direction("the direction that nodes come from")]
     """Points to the side that nodes come from, of any nonzero length."""
     along: Vector3
     """Direction of the first edges; its component along the normal is ignored."""
@@ -26,7 +28,6 @@ class Parameters(WallKeys):
 
     @model_validator(mode="after")
     def _spans(self) -> Parameters:
-        direction(self.normal, "the direction that nodes come from")
         if not np.linalg.norm(np.cross(self.normal, self.along)) > 1e-9 * np.linalg.norm(self.along) * np.linalg.norm(
             self.normal
         ):
@@ -38,6 +39,7 @@ class Wall(Plane):
     """A part of the plane n . x = d."""
 
     partial = True
+    closed = False
 
     def __init__(self, parameters: Parameters) -> None:
         super().__init__(parameters)
@@ -52,11 +54,20 @@ class Wall(Plane):
         start = before @ self.normal - self.offset
         end = x @ self.normal - self.offset
         # the point where the path crosses the plane; the foot of x if it does not
-        crossing = end < 0.0
-        part = np.where(crossing, np.clip(start, 0.0, None) / np.maximum(start - end, 1e-300), 1.0)
-        point = before + np.minimum(part, 1.0)[:, None] * (x - before) - self.centre
-        inside = (np.abs(point @ self.first) <= self.half[0]) & (np.abs(point @ self.second) <= self.half[1])
-        return inside & (start >= -tolerance)
+        part = np.where(end < 0.0, np.clip(start, 0.0, None) / np.maximum(start - end, 1e-300), 1.0)
+        return self._has(before + np.minimum(part, 1.0)[:, None] * (x - before)) & (start >= -tolerance)
+
+    def _has(self, x: np.ndarray) -> np.ndarray:
+        """Return (m,) bool: points (m, 3) of the plane that are in the rectangle."""
+        point = x - self.centre
+        return (np.abs(point @ self.first) <= self.half[0]) & (np.abs(point @ self.second) <= self.half[1])
+
+    def crossed(self, starts: np.ndarray, ends: np.ndarray) -> np.ndarray:
+        first, second = starts @ self.normal - self.offset, ends @ self.normal - self.offset
+        across = np.minimum(np.abs(first), np.abs(second)) > _SLACK * np.linalg.norm(ends - starts, axis=1)
+        across &= (first < 0.0) != (second < 0.0)
+        part = np.where(across, first / np.where(across, first - second, 1.0), 0.0)
+        return across & self._has(starts + part[:, None] * (ends - starts))
 
 
 def surface(parameters: Parameters, bounds: np.ndarray) -> Surface:

@@ -14,7 +14,7 @@ from ...errors import InputError
 from ...formats import read_triangles
 from ...mechanics.compiled import by_reference
 from ...mesh.tools import coincident
-from ..triangles import Triangles, signed_distances, stopping_faces
+from ..triangles import Triangles, stopping_faces, tangent_planes
 from .base import BaseWall, Surface, WallKeys
 
 SAME = 1e-9
@@ -26,8 +26,6 @@ _SIZES = 1e-100, 1e100
 _THIN = 1e-6
 """Thickness of sheets that stop nodes from either side, as a fraction of their size, unless it is given."""
 
-_DEEP = 0.125
-"""Depth of bars in a body, as a fraction of its width, beyond which they are reported, as in a sphere."""
 _APART = 1e-3
 """Distance of both ends from an open surface, as a fraction of their length, beyond which bars through it are."""
 
@@ -110,52 +108,31 @@ class Wall(BaseWall):
         holds = self.closed and not both and np.einsum("ti,ti->", a, np.cross(b, c)) < 0.0  # nodes are inside
         self.width = np.inf if holds else extents[0 if self.closed else 1]
 
-    def _nearest(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return signed distances (m,) of positions (m, 3), the nearest faces (m,) and places (m, 3)."""
-        distances, faces, places = np.empty(len(x)), np.empty((len(x), 2), np.int64), np.empty((len(x), 3))
-        signed_distances(self.compiled, 0, np.ascontiguousarray(x), np.inf, distances, faces, places)
-        return distances, faces[:, 0], places
+    def _tangents(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return :func:`~pfem_petsc.contact.triangles.tangent_planes` of positions (m, 3)."""
+        found = np.empty((len(x), 3)), np.empty(len(x)), np.empty(len(x))
+        tangent_planes(self.compiled, np.ascontiguousarray(x), *found)
+        return found
 
     def planes(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        distances, faces, places = self._nearest(x)
-        both, clearance, rounding = self.triangles.limits[0]
-        far = np.abs(distances) > 1e3 * rounding  # nearer, the direction from the place is that of rounding
-        arm = np.where(far[:, None], x - places, 1.0)
-        side = np.where(distances < 0.0, -1.0, 1.0)[:, None]
-        normals = np.where(
-            far[:, None],
-            arm / np.linalg.norm(arm, axis=1)[:, None] * (1.0 if both else side),
-            self.triangles.normals[faces, 0] * (side if both else 1.0),
-        )
-        return normals, np.einsum("mi,mi->m", normals, places) + clearance
+        return self._tangents(x)[:2]
 
     def gaps(self, x: np.ndarray) -> np.ndarray:
         """Return the distances (m,) of positions (m, 3) from the surface [m]: negative inside a body, without a sign
         where the surface is open, because what is behind it may have come there beside it."""
-        distances = self._nearest(x)[0]
-        both, clearance, _ = self.triangles.limits[0]
-        return distances if self.closed and not both else np.abs(distances) - clearance
+        distances = self._tangents(x)[2]
+        return distances if self.closed or self.triangles.limits[0, 0] else np.abs(distances)
 
     def crossed(self, starts: np.ndarray, ends: np.ndarray) -> np.ndarray:
         """Return (m,) bool: bars from ``starts`` to ``ends`` (m, 3) that are deep in a body, or pass through another
         surface with both ends away from it."""
         if self.closed and not self.triangles.limits[0, 0]:
-            deep, box, parts = _DEEP * self.width, self.triangles.boxes[1], np.linspace(0.0, 1.0, 9)[1:-1, None, None]
-            low, high = np.minimum(starts, ends), np.maximum(starts, ends)
-            across = ((low < box[3:]) & (high > box[:3])).all(axis=1)
-            at = np.flatnonzero(across)
-            # distances change by no more than the way
-            apart = self.gaps(starts[at]) + self.gaps(ends[at]) + 2.0 * deep
-            at = at[apart <= np.linalg.norm(ends[at] - starts[at], axis=1)]
-            inside = self.gaps((starts[at] + parts * (ends[at] - starts[at])).reshape(-1, 3)).reshape(len(parts), -1)
-            across[:] = False
-            across[at] = inside.min(axis=0) < -deep
-            return across
+            return super().crossed(starts, ends)
         apart = np.minimum(self.gaps(starts), self.gaps(ends)) > _APART * np.linalg.norm(ends - starts, axis=1)
         n = len(starts)
         free, normals, offsets = np.zeros((n, 3), dtype=bool), np.empty((n, 3, 3)), np.empty((2, n, 3))
         for k, ways in enumerate((np.stack([starts, ends]), np.stack([ends, starts]))):
-            stopping_faces(self.compiled, 0, ways, free, np.zeros(n), normals, offsets[k])
+            stopping_faces(self.compiled, ways, free, np.zeros(n), normals, offsets[k])
         return apart & np.isfinite(offsets).any(axis=(0, 2))
 
 
@@ -215,8 +192,7 @@ def surface(parameters: Parameters, bounds: np.ndarray) -> Surface:
     total = np.zeros((len(ends), 3))
     np.add.at(total, number.ravel(), np.repeat(normals, 3, axis=0))
     # the sum of two unit vectors has the squared length 2 + 2 cos
-    sharp = (count == 1) | ((total**2).sum(axis=1) < 2.0 + 2.0 * _SHARP)
-    points, lines = wall.points, ends[sharp]
+    points, lines = wall.points, ends[(count == 1) | ((total**2).sum(axis=1) < 2.0 + 2.0 * _SHARP)]
     if not len(lines):
         points, lines = _with_sections(points, ends, number, wall.centre)
     return Surface(parameters.name, points, wall.corners, np.zeros(len(points)), lines)

@@ -24,7 +24,7 @@ from .wall_motion import Poses
 
 if TYPE_CHECKING:
     from ..mechanics.mass import Inertia
-    from ..solvers.newton import StepProblem
+    from ..solvers.problem import StepProblem
     from ..stepping.model import Model
     from .constraint_set import ConstraintSet
     from .contact import Contact

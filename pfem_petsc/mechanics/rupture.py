@@ -32,7 +32,6 @@ from .materials.base import Law
 
 if TYPE_CHECKING:
     from ..case.tables import Rupture
-    from .bars import BarBlock, Bars
 
 
 LIMITS = ("stress", "strain", "compressive_stress", "compressive_strain", "plastic_strain", "damage")
@@ -208,7 +207,7 @@ def _modulus(law: Callable[..., np.ndarray]) -> Callable[..., np.ndarray]:
     return lambda p, temperatures: law(p[_OF_LAW:], temperatures)
 
 
-def state_before_rupture(bars: Bars, x: np.ndarray, bar: int) -> tuple[BarBlock, np.ndarray, float, float]:
+def state_before_rupture(bars: Any, x: np.ndarray, bar: int) -> tuple[Any, np.ndarray, float, float]:
     """Return the block of a bar (local index), its data (rows,), and its stress [Pa] and strain without the thermal
     strain at positions ``x``, as if it had not broken."""
     block = next(block for block in bars.blocks if block.start <= bar < block.stop)
@@ -225,7 +224,7 @@ def state_before_rupture(bars: Bars, x: np.ndarray, bar: int) -> tuple[BarBlock,
     return block, history[:, 0], float(stress), float(strain)
 
 
-def release(bars: Bars, x: np.ndarray, members: np.ndarray, state: float) -> np.ndarray:
+def release(bars: Any, x: np.ndarray, members: np.ndarray, state: float) -> np.ndarray:
     """Remove bars (local indices) up to a share; return by how much the
     energies of the bars counted on this rank change, in the order of :data:`~pfem_petsc.columns.BAR_ENERGIES`."""
     change = np.zeros(len(BAR_ENERGIES))

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from ..mechanics.mass import Inertia
     from ..mechanics.supports import Supports
     from ..mesh.distribution import DistributedMesh
-    from .newton import StepProblem
+    from .problem import StepProblem
 
 
 @kernel

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from mpi4py import MPI
@@ -22,7 +22,6 @@ if TYPE_CHECKING:
     from ..integrators.base import Balance
     from ..solvers.linear import LinearChoice
     from ..stepping.model import Model
-    from .methods.force_density import Parameters as ForceDensityKeys
 
 _DIRECT_UP_TO = 200_000
 """Nodes up to which a factorisation is used; beyond, conjugate gradients with multigrid, if no density is negative."""
@@ -89,7 +88,7 @@ class ForceDensityStepper(StaticStepper):
     kept_numbers = (*StaticStepper.kept_numbers, "solves")
     finds_jumps = False
 
-    def __init__(self, model: Model, choice: LinearChoice, parameters: ForceDensityKeys) -> None:
+    def __init__(self, model: Model, choice: LinearChoice, parameters: Any) -> None:
         _check(model)
         super().__init__(model, choice, parameters)
         with agreed(model.comm):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from mpi4py import MPI
@@ -32,7 +32,6 @@ from .stepper import StaticStepper
 
 if TYPE_CHECKING:
     from ..stepping.model import Model
-    from .methods.arc_length import Parameters as PathKeys
 
 
 _UNRESOLVED = 2.0**-6  # of the first length, down to which a step is halved if a critical point is not located
@@ -79,7 +78,7 @@ class PathStepper(StaticStepper):
     event_columns = EVENTS
     remedy = "reduce static.max_step or static.step; if such jumps are intended, set solver.guard = false"
 
-    def __init__(self, model: Model, choice: LinearChoice, keys: PathKeys, by_displacement: bool = False) -> None:
+    def __init__(self, model: Model, choice: LinearChoice, keys: Any, by_displacement: bool = False) -> None:
         _check_path(model, keys)
         super().__init__(model, choice, keys)
         self.keys = keys
@@ -506,7 +505,7 @@ class PathStepper(StaticStepper):
         return replace(point, tangent=sign * point.tangent, slope=float(sign * point.slope)), ""
 
 
-def _check_path(model: Model, keys: PathKeys) -> None:
+def _check_path(model: Model, keys: Any) -> None:
     """Refuse what path following does not support.
 
     Raises

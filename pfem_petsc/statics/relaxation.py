@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from mpi4py import MPI
@@ -26,7 +26,6 @@ if TYPE_CHECKING:
     from ..integrators.base import State
     from ..solvers.linear import LinearChoice
     from ..stepping.model import Model
-    from .methods.relaxation import Parameters as RelaxationKeys
 
 
 RESIDUAL, KINETIC, SUPPORTS, WALLS, BARS, FAILED, WIDTH = range(7)
@@ -300,7 +299,7 @@ class RelaxationStepper(StaticStepper):
     columns = (*StaticStepper.columns, "pseudo_steps", "residual")
     finds_jumps = False
 
-    def __init__(self, model: Model, choice: LinearChoice, parameters: RelaxationKeys) -> None:
+    def __init__(self, model: Model, choice: LinearChoice, parameters: Any) -> None:
         _check(model)
         super().__init__(model, choice, parameters)
         self.parameters = parameters

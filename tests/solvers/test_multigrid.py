@@ -10,7 +10,7 @@ from pfem_petsc.contact.transform import Transform
 from pfem_petsc.errors import InputError
 from pfem_petsc.solvers.linear import Demand, choose_linear
 from pfem_petsc.solvers.multigrid import GridMultigrid
-from pfem_petsc.solvers.newton import StepProblem
+from pfem_petsc.solvers.problem import StepProblem
 
 MULTIGRID = {"linear": "multigrid", "rtol": 1e-12}
 NEWMARK = {"integrator": "newmark", "beta": 0.25, "gamma": 0.5}

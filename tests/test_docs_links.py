@@ -108,7 +108,7 @@ def test_scripts_find_their_marks():
             marks = re.findall(r'"(<!-- [^"]*? -->)', text)
             assert len(marks) >= 2 and all(page.read_text().count(mark + "\n") == 1 for mark in marks), script
             found += len(marks)
-    assert found == 22
+    assert found == 24
 
 
 def test_one_version():

@@ -316,7 +316,10 @@ def evaluate_pairs(pairs, state, old, new, nodes, law, out):
             failed = 1 + p
         mobility = (1.0 - s) ** 2 * nodes.inverse[ends[0]] + s**2 * nodes.inverse[ends[1]]
         mobility += (1.0 - t) ** 2 * nodes.inverse[ends[2]] + t**2 * nodes.inverse[ends[3]]
-        total = _damp(pairs, p, law, push, closing, mobility)
+        total = push
+        if law.lead > 0.0 or state[p] == TOUCHING:
+            # the damper of a pair that begins to touch would jump: a step that ends just there had no solution
+            total = _damp(pairs, p, law, push, closing, mobility)
         lost -= 0.5 * (old[p, VISCOUS] + total - push) * closing
         if total != push:
             _gradient(g, s, t, times(total - push, normal))
@@ -411,9 +414,10 @@ def add_step_gradients(pairs, state, nodes):
 
 
 @kernel
-def differentiate_pairs(pairs, chosen, old, nodes, law, whole, blocks):
-    """Write the derivatives (k, 12, 12) of the forces of ``chosen`` (k,) pairs by the positions of their ends, those of
-    discrete gradients if ``whole``; the other arguments as for :func:`evaluate_pairs`.
+def differentiate_pairs(pairs, states, old, nodes, law, whole, blocks):
+    """Write the derivatives (k, 12, 12) of the forces of the pairs (m,) that by their ``states`` (m,) are not apart, by
+    the positions of their ends, those of discrete gradients if ``whole``; the other arguments as for
+    :func:`evaluate_pairs`.
 
     The force is evaluated at positions with a tiny imaginary part, that of which is the derivative to rounding, as
     nothing is subtracted (Squire and Trapp, 1998): of everything that depends on the positions, such as where bars
@@ -421,13 +425,14 @@ def differentiate_pairs(pairs, chosen, old, nodes, law, whole, blocks):
     """
     new, out, state = np.zeros((1, old.shape[1]), np.complex128), np.zeros(6, np.complex128), np.zeros(1, np.uint8)
     own = NodeArrays(np.zeros((4, 6), np.complex128), np.zeros(4), np.zeros((4, 3), np.complex128))
+    chosen = np.flatnonzero(states != APART)
     for k in range(len(chosen)):
         p = chosen[k]
         for column in range(12):
             pair = _take_pair(pairs, p, nodes, own)
             own.x[column // 3, column % 3] += 1j * _TINY
             own.x[column // 3, 3 + column % 3] += 1j * _TINY
-            state[0], own.force[:] = TOUCHING, 0.0
+            state[0], own.force[:] = states[p], 0.0
             if whole:
                 add_step_gradients(pair, state, own)
             else:
@@ -911,9 +916,9 @@ class SelfContact:
         arrays, state, law = self._look(x, self._step, False) or (None, None, None)
         if state is None:
             return np.empty(0, dtype=np.int64), np.empty(0, dtype=np.int64), np.empty((0, 3, 3))
-        chosen = np.flatnonzero((self._state == TOUCHING) | (state != APART))
+        chosen = np.flatnonzero(state != APART)
         ends, blocks = self._pairs.ends[chosen], np.empty((len(chosen), 12, 12))
-        differentiate_pairs(self._pairs, chosen, self._memory, arrays, law, balance.discrete_gradient, blocks)
+        differentiate_pairs(self._pairs, state, self._memory, arrays, law, balance.discrete_gradient, blocks)
         if self.symmetric and not balance.discrete_gradient:
             blocks = 0.5 * (blocks + blocks.transpose(0, 2, 1))
         left, right = self._gather(self._coordinates(turns), 18).reshape(-1, 2, 3, 3).transpose(1, 0, 2, 3)

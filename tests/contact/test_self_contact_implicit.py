@@ -78,7 +78,8 @@ def test_derivatives_are_those_of_finite_differences(kind):
         memory[0, NORMAL : NORMAL + 3] = ((1.0 - t) * x[2] + t * x[3] - (1.0 - s) * x[0] - s * x[1]) / d
         memory[0, SPRING : SPRING + 3] = 1e-3 * random.normal(size=3)
         blocks = np.empty((1, 12, 12))
-        differentiate_pairs(*_first(x, moved), memory, one_pair(x, moved)[1], law, kind == "step", blocks)
+        pairs, nodes = one_pair(x, moved)
+        differentiate_pairs(pairs, np.ones(1, dtype=np.uint8), memory, nodes, law, kind == "step", blocks)
         differences = np.empty((12, 12))
         for column in range(12):
             e = (h * np.eye(12)[column]).reshape(4, 3)

@@ -467,6 +467,34 @@ class ConstraintSet:
                 "beyond it; correct its keys, or move the mesh"
             )
 
+    def check_carried(self, x: np.ndarray, where: str) -> None:
+        """Check that supports, which prescribe all components of the nodes of some rows, have not moved these beyond
+        each other, at positions (owned, 3) [m]. Collective.
+
+        ``where``: the step, for the message
+
+        Raises
+        ------
+        SimulationFailure
+            On all ranks, with the table, the nodes, how far they are beyond, the step, and the remedy.
+        """
+        if not self:
+            return
+        rows, x = self.rows, self.rows.gather(x)
+        values = np.where(rows.usable(rows.gradients(x)), np.inf, rows.values(x))
+        deepest: tuple[Any, ...] = (-BEYOND * self.contact.size,)
+        if len(values) and values.min() < deepest[0]:
+            row = int(np.argmin(values))
+            numbers = [str(n) for n in rows.numbers[rows.ends[row][rows.ends[row] >= 0]]]
+            deepest = float(values[row]), self.columns[rows.source[row]].replace("/", " "), ", ".join(numbers)
+        deepest = min(self.mesh.comm.allgather(deepest))
+        if len(deepest) > 1:
+            depth, name, nodes = deepest
+            raise SimulationFailure(
+                f"{where}: nodes {nodes} of {name!r} are {-depth:.3g} m beyond each other, moved there by their "
+                "supports; free one of them, change the motion of the supports, or remove these nodes from the table"
+            )
+
     def _check_relative(self) -> None:
         """Refuse rows that would need relative coordinates and can have none. Collective."""
         rows = self.rows

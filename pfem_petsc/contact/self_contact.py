@@ -586,6 +586,12 @@ class SelfContact:
         self._thick = 2.0 * comm.allreduce(float(self._radius[self._bars].max(initial=0.0)), op=MPI.MAX)
         self._mean, self._listed = float(sums[0] / max(sums[1], 1.0)), -1.0
         self._skin = 2.0 * _SKIN[0] * self._mean
+        if self._thick > self._mean > 0.0:
+            model.warnings.append(
+                f"[self_contact]: bars are up to {self._thick:.3g} m thick and {self._mean:.3g} m long on average; "
+                "those that are closer in the mesh than a quarter of the thickness do not touch: correct "
+                "self_contact.radius [m], or the area of the section, if it is in another unit"
+            )
         self._friction, self._damping = float(table.friction), damping_of(float(table.restitution))
         self._starts = owner_starts(mesh)
         self._numbers = np.concatenate([mesh.first_node + np.arange(mesh.n_owned), mesh.ghost_numbers])

@@ -379,6 +379,7 @@ class Snapshots(Observer):
         held = self._stepper.held_by_contact()
         if held is not None:
             check_positions(self._stepper.model, *held, at)
+        self._stepper.model.links.check_carried(state.position, at)
         now = Snapshot(self._stepper.model, state, self._stepper.acceleration)
         points = state.position.copy()  # as all values that are written while the next steps change the state
         self.writer.begin_snapshot(place, number, points, fields.at("nodes", now), fields.at("bars", now))

@@ -14,7 +14,7 @@ from helpers.lattices import (
 )
 
 from pfem_petsc import Case, Simulation
-from pfem_petsc.errors import InputError
+from pfem_petsc.errors import InputError, SimulationFailure
 
 EXPLICIT = [{"integrator": name} for name in ("central_differences", "chung_lee", "hulbert_chung")]
 IMPLICIT = [{"integrator": name} for name in ("newmark", "generalized_alpha", "energy_momentum", "houbolt")]
@@ -179,3 +179,28 @@ def test_pairs_that_never_press_are_told_at_the_end(comm, shared_tmp_path, end, 
     if comm.rank == 0:
         log = (shared_tmp_path / "rods" / "log.txt").read_text()
         assert log.count("contact pair 'faces' never carried a force") == told
+
+
+@pytest.mark.parallel
+@pytest.mark.parametrize("time", [{"integrator": "central_differences"}, {"integrator": "generalized_alpha"}, None])
+def test_supports_that_carry_nodes_through_pairs_are_told(time, comm, shared_tmp_path):
+    """Nothing can stop nodes of which supports prescribe every component."""
+    case = {
+        "mesh": {
+            "generator": "arrays",
+            "points": [[0, 0, 0], [1, 0, 0], [0, 0, 1], [1, 0, 1]],
+            "bars": [[0, 1], [2, 3]],
+        },
+        "node_set": {"a": {"indices": [0, 1]}, "b": {"indices": [2, 3]}},
+        "material": {"m": {"young_modulus": 1e7, "density": 1000.0}},
+        "section": {"s": {"area": 1e-4, "material": "m"}},
+        "support": [
+            {"node_set": "a", "fix": "xyz"},
+            {"node_set": "b", "fix": "xyz", "motion": [[0, 0, 0, 0], [0.1, 0, 0, -2.0]]},
+        ],
+        "contact_pair": [{"name": "p", "first": "a", "second": "b", "direction": [0, 0, 1]}],
+        "output": {"fields_every": 10},
+    }
+    case |= {"static": {"step": 0.02, "end": 0.1}} if time is None else {"time": time | {"step": 1e-3, "end": 0.1}}
+    with pytest.raises(SimulationFailure, match="nodes 0, 2 of 'pair p' are .* m beyond each other, moved there by"):
+        simulation(case, comm, shared_tmp_path, label(time or {"static": 0})).run()

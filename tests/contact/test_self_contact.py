@@ -453,3 +453,20 @@ def test_bars_that_break_on_some_ranks_only(comm, shared_tmp_path):
     momentum = column(rows, "momentum")[:, 0]
     np.testing.assert_allclose(momentum, momentum[0], rtol=1e-12)
     assert np.abs(column(rows, "energy_imbalance")).max() < 1e-12 * rows[0]["kinetic_energy"]
+
+
+def test_a_radius_in_another_unit_is_told(comm, tmp_path):
+    """Bars that are closer in the mesh than a quarter of their thickness do not touch, which would be all of them."""
+    case = {
+        "mesh": {
+            "generator": "arrays",
+            "points": [[-1, 0, 0], [1, 0, 0], [0, -1, 0.1], [0, 1, 0.1]],
+            "bars": [[0, 1], [2, 3]],
+        },
+        "material": {"m": {"young_modulus": 1e7, "density": 1000.0}},
+        "section": {"s": {"area": 1e-4, "material": "m"}},
+        "self_contact": {"radius": 5.0},
+        "time": {"integrator": "central_differences", "step": 1e-3, "end": 2e-3},
+    }
+    run = Simulation(Case.from_dict(case), comm, output=tmp_path, quiet=True)
+    assert any("bars are up to 10 m thick and 2 m long on average" in text for text in run.model.warnings)

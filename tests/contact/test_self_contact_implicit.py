@@ -97,10 +97,6 @@ def test_derivatives_are_those_of_finite_differences(kind):
     assert compared > 25
 
 
-def _first(x, moved):
-    return one_pair(x, moved)[0], np.zeros(1, dtype=np.int64)
-
-
 def test_the_work_of_a_step_is_the_change_of_the_energy():
     random, memory = np.random.default_rng(5), np.zeros((1, WIDTH))
     for _, x in branches():

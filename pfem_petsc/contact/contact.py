@@ -269,7 +269,7 @@ def check_positions(model: Any, x: np.ndarray, time: float, where: str) -> None:
     depth, node, wall, count = found
     own = np.flatnonzero(model.mesh.node_ids[: len(x)] == node)
     if comm.allreduce(len(own) > 0 and _prescribed(contact, own[0], wall, x, time)):
-        raise SimulationFailure(_told(where, node, depth, contact.names[wall], count))
+        raise SimulationFailure(_told(contact, where, node, wall, (depth, count)))
     treatment = model.case.contact.treatment
     others = f'contact.treatment = "scheme" instead of "{treatment}"'
     others = others if treatment != "scheme" else "another contact.treatment or time.integrator"
@@ -280,12 +280,17 @@ def check_positions(model: Any, x: np.ndarray, time: float, where: str) -> None:
     )
 
 
-def _told(where: str, node: int, depth: float, wall: str, count: int) -> str:
-    """Return the message about nodes that supports move beyond a wall."""
+def _told(contact: Contact, where: str, node: int, wall: int, found: tuple[float, int]) -> str:
+    """Return the message about nodes that supports move or hold beyond a wall: the deepest, and ``found``: its depth
+    [m] and how many there are."""
+    (depth, count), cause = found, "moved there by its supports"
+    remedy = "let the wall move with the supports, name the nodes that it stops with 'node_set', or do not tie them"
+    if wall in contact.motion.bodies.at:
+        cause = "held there by its supports, and a wall with mass is stopped only by nodes that can move"
+        remedy = "free the node, and hold it by a bar or a [[spring]]"
     return (
-        f"{where}: node {node} is {depth:.3g} m beyond wall {wall!r} "
-        f"({count} node{'s' if count > 1 else ''} in all), moved there by its supports; let the wall move with "
-        "the supports, name the nodes that it stops with 'node_set', or do not tie them"
+        f"{where}: node {node} is {depth:.3g} m beyond wall {contact.names[wall]!r} "
+        f"({count} node{'s' if count > 1 else ''} in all), {cause}; {remedy}"
     )
 
 
@@ -332,7 +337,7 @@ class CarriedNodes:
             if crossed.any():
                 at = int(np.argmax(np.where(crossed, depth, 0.0)))
                 node = int(contact.mesh.node_ids[nodes[at]])
-                return _told(where, node, float(depth[at]), contact.names[k], int(crossed.sum()))
+                return _told(contact, where, node, k, (float(depth[at]), int(crossed.sum())))
         return None
 
 

@@ -68,6 +68,15 @@ def test_supports_that_carry_a_node_through_a_wall_are_told(mass, tied, comm, sh
     assert all(re.search(message, text) for text in comm.allgather(str(failure.value)))
 
 
+def test_walls_with_mass_that_meet_held_nodes_are_told(comm, shared_tmp_path):
+    """Nothing that the program solves for stops such a wall."""
+    keys = ['support=[{node_set="tip", fix="xyz"}]', "initial.velocity=[0.0, 0.0, 0.0]", "output.fields_every=10"]
+    with pytest.raises(SimulationFailure) as failure:
+        run(comm, shared_tmp_path, *keys, "wall.0.mass=1.0", "wall.0.velocity=[-1.0, 0.0, 0.0]")
+    message = r"node 20 is 0.\d+ m beyond wall 'wall' .*, held there by its supports, and a wall with mass is stopped"
+    assert all(re.search(message, text) for text in comm.allgather(str(failure.value)))
+
+
 @pytest.mark.parallel
 @pytest.mark.parametrize("scheme", ["central_differences", "houbolt"])
 @pytest.mark.parametrize("beside, told", [(0.0, True), (0.2, False)])

@@ -448,9 +448,8 @@ class _Conditions:
     def _hold(self, block: Block, words: list[str]) -> str:
         axes, value = _FIXED.get(words[1].upper() if len(words) > 1 else "", ""), 0.0
         if not axes:
-            first = _value(words, 1)
-            last = _value(words, 2) or first
-            value = _value(words, 3)
+            first, last, value = (_value(words, at) for at in (1, 2, 3))
+            last = last or first
             if not (1.0 <= first <= last <= 6.0 and np.isfinite(value)):
                 return "left out: expected degrees of freedom from 1 to 6, and a number"
             axes = "xyz"[int(first) - 1 : int(last)]  # bars have no rotations

@@ -69,10 +69,8 @@ def read_on(path: Path, comm: MPI.Comm, fields: Mapping[str, str] | None = None)
             if piece.min() < limits.min or piece.max() > limits.max:
                 piece = np.where((piece < 0) | (piece >= n_nodes), -1, piece)
             slab.bars[start - first : stop - first] = piece
-        slab.bar_fields = {name: _share_of(file[f"bar_fields/{name}"], first, last) for name in wanted["bar_fields"]}
-        slab.node_fields = {
-            name: _share_of(file[f"node_fields/{name}"], first_node, last_node) for name in wanted["node_fields"]
-        }
+        for kind, *share in (("bar_fields", first, last), ("node_fields", first_node, last_node)):
+            setattr(slab, kind, {name: _share_of(file[f"{kind}/{name}"], *share) for name in wanted[kind]})
     for kind, n in (("node_groups", n_nodes), ("bar_groups", n_bars)):
         for name in content.groups[kind]:
             getattr(slab, kind)[name] = _members(path, f"{kind}/{name}", n, comm)
@@ -162,9 +160,8 @@ def _members(path: Path, name: str, n: int, comm: MPI.Comm) -> np.ndarray:
     for start in range(begin, begin - (-total // comm.size), PIECE):
         with agreed(comm), _opened(path) as file:
             numbers = file[name][min(start, end) : min(start + PIECE, end)].astype(np.int64)
-            outside = numbers[(numbers < 0) | (numbers >= n)]
-            if len(outside):
-                raise InputError(f"{path}: /{name} has member {outside[0]}, but numbers go from 0 to {n - 1}")
+            for outside in numbers[(numbers < 0) | (numbers >= n)][:1]:
+                raise InputError(f"{path}: /{name} has member {outside}, but numbers go from 0 to {n - 1}")
         mask[Router(comm, slab_of(numbers, n, comm.size)).send(numbers) - first] = True
     return first + np.flatnonzero(mask)
 

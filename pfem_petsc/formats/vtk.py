@@ -184,9 +184,8 @@ def _arrays(grid: Any) -> Iterator[tuple[str, Any]]:
         raise ValueError("lines that do not have two ends; a bar has two")
     if first.min() < 0 or (first + size).max() > len(ends):
         raise ValueError("lines whose nodes do not exist: a damaged file")
-    wrong = ends[(ends < 0) | (ends >= n_nodes)]
-    if len(wrong):
-        raise ValueError(f"there is no point {wrong[0]}, at which a cell ends: the file has {n_nodes}, numbered from 0")
+    for wrong in ends[(ends < 0) | (ends >= n_nodes)][:1]:
+        raise ValueError(f"there is no point {wrong}, at which a cell ends: the file has {n_nodes}, numbered from 0")
     # a line of several points is as many bars less one, a face as many as it has corners: the cell of each bar, and
     # which of its points come first and second
     count = size if of_faces else size - 1

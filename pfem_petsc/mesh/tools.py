@@ -160,16 +160,15 @@ def merged(meshes: Sequence[WholeMesh], tolerance: float | None = None) -> tuple
         setattr(together, kind, groups)
     for kind in ("bar_fields", "node_fields"):
         fields = [getattr(mesh, kind) for mesh in meshes]
-        for name in sorted(set().union(*fields)):
-            if all(name in own for own in fields):
-                getattr(together, kind)[name] = np.concatenate([own[name] for own in fields])
-            else:
-                done.append(f"field {name} left out: not all files have it")
+        common = set(fields[0]).intersection(*fields)
+        setattr(together, kind, {name: np.concatenate([own[name] for own in fields]) for name in sorted(common)})
+        others = sorted(set().union(*fields) - common)
+        done += [f"field {name} left out: not all files have it" for name in others]
     for mesh in meshes:
         together.warnings += mesh.warnings
         for table, rows in mesh.tables.items():
-            if table == "analysis" and table in together.tables:
-                rows = together.tables[table]  # that of the first file that has one
+            # the analysis is that of the first file that has one
+            rows = together.tables.get(table, rows) if table == "analysis" else rows
             into: dict[str, Any] = together.tables.setdefault(table, {})
             differing = [name for name, keys in rows.items() if into.setdefault(name, keys) != keys]
             told = "differs from that of an earlier file, which is kept"

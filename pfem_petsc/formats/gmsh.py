@@ -88,13 +88,11 @@ def read(path: Path, fields: Collection[str] | None = None) -> WholeMesh:
             name, own, values = _data(f"{path}: section ${kind}", payload, layout)
             order = np.argsort(own, kind="stable")
             place, there = places_of(own[order], tags)
-            where = f"{path}: section ${kind} {name!r} is left out"
-            if values is None:
-                mesh.warnings.append(f"{where}: a field has a name without slash and one component")
-            elif there.all() and not np.isnan(values).any():
-                found[name] = values[order[place], 0]
-            else:
-                mesh.warnings.append(f"{where}: it does not have a value for each {what}")
+            whole = values is not None and there.all() and not np.isnan(values).any()
+            why = f"it does not have a value for each {what}"
+            why = "a field has a name without slash and one component" if values is None else why
+            mesh.tell(not whole, f"{path}: section ${kind} {name!r} is left out: {why}")
+            found |= {name: values[order[place], 0]} if whole else {}
     return mesh
 
 

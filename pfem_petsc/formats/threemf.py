@@ -251,8 +251,7 @@ def _assembled(path: Path, model: _Model) -> WholeMesh:
     mesh = WholeMesh(np.concatenate(points), np.concatenate(bars), *groups)
     one, two = np.concatenate(radii).T
     area = np.where(one == two, np.pi * one * one, np.pi / 3.0 * (one * one + one * two + two * two))
-    if (area > 0.0).all():
-        mesh.bar_fields["area"] = area
+    mesh.bar_fields |= {"area": area} if (area > 0.0).all() else {}
     cones = int((one != two).sum())
     mesh.warnings = [f"{path}: requires the extension {uri}, which is not read" for uri in model.not_read]
     mesh.tell(cones, f"{path}: {cones} beams whose radii differ have a constant area, with the same volume")

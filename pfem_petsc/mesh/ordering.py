@@ -173,10 +173,7 @@ def _spacing(extents: np.ndarray, n: int) -> float:
     low = high / n
     for _ in range(60):
         middle = low**0.5 * high**0.5
-        if np.prod(extents / middle + 1.0) > n:
-            low = middle
-        else:
-            high = middle
+        low, high = (middle, high) if np.prod(extents / middle + 1.0) > n else (low, middle)
     return high
 
 

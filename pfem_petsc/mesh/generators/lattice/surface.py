@@ -163,9 +163,8 @@ class Surface:
         places: list[tuple[float, float, float]] = []
         for n, (a, b) in enumerate(zip(starts.tolist(), ends.tolist())):
             locator.IntersectWithLine(a, b, 0.0, points, cells)
-            for k in range(points.GetNumberOfPoints()):
-                lines.append(n)
-                places.append(points.GetPoint(k))
+            lines += [n] * points.GetNumberOfPoints()
+            places += map(points.GetPoint, range(points.GetNumberOfPoints()))
         line, place = np.array(lines, np.int64), np.array(places).reshape(-1, 3)
         way = ends[line] - starts[line]
         along = np.einsum("ij,ij->i", place - starts[line], way) / np.einsum("ij,ij->i", way, way)

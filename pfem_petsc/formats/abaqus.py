@@ -357,8 +357,8 @@ class _Conditions:
     def add(self) -> None:
         """Add the tables to the mesh, and warnings."""
         kinds = {"DLOAD": self._weigh, "CLOAD": self._push, "BOUNDARY": self._hold, "TEMPERATURE": self._heat}
-        new = [each for each, step in self._deck.conditions if each.keyword == "BOUNDARY" and step]
-        new = [each for each in new if each.get("OP").upper() == "NEW"]
+        steps = [each for each, in_step in self._deck.conditions if in_step]
+        new = [each for each in steps if each.keyword == "BOUNDARY" and each.get("OP").upper() == "NEW"]
         for block, in_step in self._deck.conditions:
             if block in new[:1]:
                 self._supports.clear()

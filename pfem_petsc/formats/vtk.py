@@ -59,8 +59,8 @@ def read(path: Path, fields: Collection[str] | None = None) -> WholeMesh:
     from ..mesh.whole import WholeMesh
 
     command = [sys.executable, "-P", "-m", __name__, str(path.resolve())]
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(p for p in sys.path if p)}
-    done = subprocess.run(command, env=environment, capture_output=True, check=False)
+    path_of_modules = {"PYTHONPATH": os.pathsep.join(p for p in sys.path if p)}
+    done = subprocess.run(command, env=os.environ | path_of_modules, capture_output=True, check=False)
     if done.returncode == _REFUSED:
         raise InputError(f"{path}: {done.stdout.decode(errors='replace').strip()}")
     if done.returncode < 0:

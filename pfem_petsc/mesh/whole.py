@@ -162,13 +162,6 @@ def tables_of(mesh: WholeMesh) -> tuple[dict[str, Any], list[str]]:
     return {"node_set": node_sets, "material": materials, "section": sections, **conditions}, made
 
 
-def _probes(mesh: WholeMesh) -> list[dict[str, str]]:
-    """Return probes for node sets with loads or motions, but for large ones: each node has columns of the history."""
-    moved = [keys for keys in mesh.tables.get("support", {}).values() if len(keys) > 2]
-    names = dict.fromkeys(keys["node_set"] for keys in (*mesh.tables.get("load", {}).values(), *moved))
-    return [{"name": name, "node_set": name} for name in names if len(mesh.node_groups[name]) <= _PROBED]
-
-
 def skeleton(mesh: WholeMesh, file: Path, case: Path) -> str:
     """Return the text of a case file at ``case`` for a mesh file, which can be checked and run."""
     tables, made = tables_of(mesh)
@@ -187,8 +180,11 @@ def skeleton(mesh: WholeMesh, file: Path, case: Path) -> str:
         **({} if known else {"gravity": {"acceleration": [0.0, 0.0, -9.81]}}),
         **(analysis or {"time": {"integrator": "central_differences", "step": "auto", "end": 1e-3}}),
     }
-    probes = _probes(mesh) if data.keys() & {"static", "time"} else []
-    data |= {"output": {"probe": probes}} if probes else {}
+    # each node of a probe has columns of the history
+    moved = [keys for keys in mesh.tables.get("support", {}).values() if len(keys) > 2]
+    names = dict.fromkeys(keys["node_set"] for keys in (*mesh.tables.get("load", {}).values(), *moved))
+    probes = [{"name": name, "node_set": name} for name in names if len(mesh.node_groups[name]) <= _PROBED]
+    data |= {"output": {"probe": probes}} if probes and data.keys() & {"static", "time"} else {}
     held = next(iter(tables["node_set"]), "NAME")
     example = "" if tables["node_set"] else _NODE_SET
     example += f'\n# [[support]]\n# node_set = "{held}"\n# fix = "xyz"\n'

@@ -277,10 +277,9 @@ class _Conditions:
             free = int((~held[:, axis]).sum())
             self._told(free, f"the case holds {free} nodes of a flat truss along {'xyz'[axis]}, as AUTOSPC does")
             held[:, axis] = True
-        moving = {"interpolation": "linear"}
         return {
             name: {"node_set": name, "fix": _axes(row)}
-            | ({"motion": [[0.0] * 4, [1.0, *row[3:]]], **moving} if any(row[3:]) else {})
+            | ({"motion": [[0.0] * 4, [1.0, *row[3:]]], "interpolation": "linear"} if any(row[3:]) else {})
             for row, name in self._tables(np.hstack([held, moved]), lambda row: f"fixed_{_axes(row)}")
         }
 

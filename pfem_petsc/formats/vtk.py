@@ -22,6 +22,7 @@ import subprocess
 import sys
 from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from xml.sax.saxutils import escape
@@ -255,13 +256,11 @@ def write(path: Path, mesh: WholeMesh) -> None:
     writer.SetFileName(str(path))
     if legacy:
         writer.SetFileTypeToBinary()
-    writer.SetInputData(grid_of(mesh, str if legacy else _escaped, polygonal=path.suffix.lower() == ".vtp"))
+    # VTK writes names into XML as they are
+    named = str if legacy else partial(escape, entities={'"': "&quot;", "\t": "&#9;", "\n": "&#10;", "\r": "&#13;"})
+    writer.SetInputData(grid_of(mesh, named, polygonal=path.suffix.lower() == ".vtp"))
     if not writer.Write() or not path.is_file():
         raise InputError(f"{path}: VTK could not write the file; is there room?")
-
-
-def _escaped(name: str) -> str:
-    return escape(name, {'"': "&quot;", "\t": "&#9;", "\n": "&#10;", "\r": "&#13;"})  # VTK writes names as they are
 
 
 def grid_of(mesh: WholeMesh, named: Callable[[str], str] = str, polygonal: bool = False) -> pyvista.DataSet:

@@ -191,8 +191,7 @@ def refined(mesh: WholeMesh, n: int) -> WholeMesh:
     between = old + np.arange(count * (n - 1)).reshape(count, n - 1)
     chain = np.concatenate([mesh.bars[:, :1], between, mesh.bars[:, 1:]], axis=1)
     bars = np.stack([chain[:, :-1], chain[:, 1:]], axis=2).reshape(-1, 2)
-    parts = np.arange(n)
-    groups = {name: (np.asarray(own)[:, None] * n + parts).ravel() for name, own in mesh.bar_groups.items()}
+    groups = {name: (np.asarray(own)[:, None] * n + np.arange(n)).ravel() for name, own in mesh.bar_groups.items()}
     unknown = np.full(len(inner), np.nan)
     return replace(
         mesh,

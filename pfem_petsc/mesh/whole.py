@@ -165,7 +165,6 @@ def tables_of(mesh: WholeMesh) -> tuple[dict[str, Any], list[str]]:
 def skeleton(mesh: WholeMesh, file: Path, case: Path) -> str:
     """Return the text of a case file at ``case`` for a mesh file, which can be checked and run."""
     tables, made = tables_of(mesh)
-    relative = os.path.relpath(file.absolute(), case.absolute().parent)
     known = [name for name in _CONDITIONS if mesh.tables.get(name, {}).keys() - {PLANE}]
     analysis = mesh.tables.get("analysis", {})
     missing = "supports and loads" if analysis else "supports, loads, and the analysis"
@@ -175,7 +174,7 @@ def skeleton(mesh: WholeMesh, file: Path, case: Path) -> str:
     lines = [f"# A case for {file.name}. {told}\n", *(f"#   {key}\n" for key in made), "\n"]
     data = {
         "title": mesh.title or file.stem,
-        "mesh": {"file": relative},
+        "mesh": {"file": os.path.relpath(file.absolute(), case.absolute().parent)},
         **{name: table for name, table in tables.items() if table},
         **({} if known else {"gravity": {"acceleration": [0.0, 0.0, -9.81]}}),
         **(analysis or {"time": {"integrator": "central_differences", "step": "auto", "end": 1e-3}}),

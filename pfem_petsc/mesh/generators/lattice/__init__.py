@@ -73,8 +73,7 @@ def generate_on(
             if name not in (keys.bar_fields or {}):
                 known = ", ".join(keys.bar_fields or {}) or "none"
                 raise InputError(f"{key} = {name!r}: mesh.bar_fields has no such field; it has {known}")
-    file = keys.surface
-    surface = on_root(comm, read_surface, Path(file.file), file.scale) if file is not None else None
+    surface = None if keys.surface is None else on_root(comm, read_surface, Path(keys.surface.file), keys.surface.scale)
     partial = bool(keys.missing or surface or keys.keep is not None)
     with agreed(comm):
         block = Block(fitted(keys, surface) if surface is not None else keys, plain=not partial)

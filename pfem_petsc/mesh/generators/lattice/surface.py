@@ -193,10 +193,9 @@ def bodies_of(points: np.ndarray, triangles: np.ndarray, where: str) -> Surface:
         Beginning with ``where``, if bodies intersect, if a body has no inner side, or if triangles at an edge cannot be
         assigned to bodies.
     """
-    warnings: list[str] = []
     triangles, copies = _without_copies(triangles)
-    if copies:
-        warnings.append(f"{copies} triangles are in the file more than once: bodies at the same place count as one")
+    twice = f"{copies} triangles are in the file more than once: bodies at the same place count as one"
+    warnings = [twice] * bool(copies)
     parts, given = [], []
     for members, turned in _connected(points, triangles, where) if len(triangles) else ():
         own = triangles[members]

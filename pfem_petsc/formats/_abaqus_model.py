@@ -152,12 +152,10 @@ def _row(where: str, words: list[str], width: int, least: int) -> np.ndarray:
             f"{where}: {', '.join(words)[:60]!r} has {len(words)} values; expected "
             f"{least}{'' if least == width else f' to {width}'} with commas"
         )
-    row = np.full((1, width), np.nan)
-    for k, word in enumerate(words):
-        row[0, k] = number_of(word)
-        if word and np.isnan(row[0, k]):
-            raise InputError(f"{where}: {word[:40]!r} is not a number")
-    return row
+    values = [number_of(word) for word in words]
+    for word in [word for word, value in zip(words, values) if word and np.isnan(value)][:1]:
+        raise InputError(f"{where}: {word[:40]!r} is not a number")
+    return np.array([values + [np.nan] * (width - len(values))])
 
 
 def _alike(text: bytes) -> np.ndarray | None:
@@ -463,9 +461,8 @@ class Deck:
         """Read a keyword; return whether to go on."""
         keyword = block.keyword
         self._last = block
-        for name in block.parameters:
-            if name not in KNOWN.get(keyword, block.parameters):
-                self._unknown.setdefault((keyword, name), block.where)
+        for name in [name for name in block.parameters if name not in KNOWN.get(keyword, block.parameters)]:
+            self._unknown.setdefault((keyword, name), block.where)
         if keyword in _OPEN and not self._ended:
             self._open[keyword] = None
         elif keyword.startswith("END "):
@@ -590,7 +587,6 @@ class Deck:
         instance = block.get("INSTANCE").upper()
         if instance and instance not in self.scopes:
             raise InputError(f"{block.where}: there is no instance {instance}")
-        numbers = None
         if kind == "NSET" and block.get("ELSET"):
             named = self._named("ELSET", block, block.get("ELSET"), self._scope, instance)
             for entry in named or [_Labels(_NOTHING)]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from itertools import count
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -67,12 +67,11 @@ def shown(text: bytes) -> str:
     return text[:60].decode("utf-8", "replace")
 
 
-def name_of(groups: dict[str, np.ndarray], members: np.ndarray, wanted: str) -> str:
-    """Return the name of the group with these members, perhaps a new one: ``wanted``, or with a number after it."""
-    for name in (wanted, *groups):
-        if name in groups and np.array_equal(groups[name], members):
-            return name
-    name = free_name(groups, wanted)
+def name_of(groups: dict[str, np.ndarray], members: np.ndarray, wanted: str, among: Iterable[str] | None = None) -> str:
+    """Return the name of the group with these members, of those ``among`` which it may be (None: all), perhaps a new
+    one: ``wanted``, or with a number after it."""
+    known = [name for name in ((wanted, *groups) if among is None else among) if name in groups]
+    name = next((name for name in known if np.array_equal(groups[name], members)), "") or free_name(groups, wanted)
     groups[name] = members
     return name
 

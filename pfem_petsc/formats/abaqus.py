@@ -357,8 +357,8 @@ class _Conditions:
     def add(self) -> None:
         """Add the tables to the mesh, and warnings."""
         kinds = {"DLOAD": self._weigh, "CLOAD": self._push, "BOUNDARY": self._hold, "TEMPERATURE": self._heat}
-        new = [each for each, step in self._deck.conditions if each.keyword == "BOUNDARY" and step]
-        new = [each for each in new if each.get("OP").upper() == "NEW"]
+        steps = [each for each, in_step in self._deck.conditions if in_step]
+        new = [each for each in steps if each.keyword == "BOUNDARY" and each.get("OP").upper() == "NEW"]
         for block, in_step in self._deck.conditions:
             if block in new[:1]:
                 self._supports.clear()
@@ -448,9 +448,8 @@ class _Conditions:
     def _hold(self, block: Block, words: list[str]) -> str:
         axes, value = _FIXED.get(words[1].upper() if len(words) > 1 else "", ""), 0.0
         if not axes:
-            first = _value(words, 1)
-            last = _value(words, 2) or first
-            value = _value(words, 3)
+            first, last, value = (_value(words, at) for at in (1, 2, 3))
+            last = last or first
             if not (1.0 <= first <= last <= 6.0 and np.isfinite(value)):
                 return "left out: expected degrees of freedom from 1 to 6, and a number"
             axes = "xyz"[int(first) - 1 : int(last)]  # bars have no rotations
@@ -501,11 +500,8 @@ class _Conditions:
         wanted = target.replace('"', "").replace("/", "_")
         last = wanted.rpartition(".")[2]
         new = f"node_{wanted}" if last.isdecimal() else wanted
-        known = [*(self._names.get(upper) for upper in (wanted.upper(), last.upper())), new]
-        name = next((each for each in known if each in groups and np.array_equal(groups[each], members)), None)
-        name = name or free_name(groups, new)
-        groups[name] = members
-        return name, members
+        known = [*(self._names.get(upper, "") for upper in (wanted.upper(), last.upper())), new]
+        return name_of(groups, members, new, known), members
 
     # ---- tables
 
@@ -767,22 +763,18 @@ def _section_lines(mesh: WholeMesh, names: dict[str, str]) -> Iterator[str]:
         if keys.get("material"):
             material[members] = materials.index(keys["material"])
     pairs, which = np.unique(np.column_stack([np.nan_to_num(areas, nan=-1.0), material]), axis=0, return_inverse=True)
-    which = which.ravel()
-    order = np.argsort(which, kind="stable")
-    starts = np.searchsorted(which[order], np.arange(len(pairs) + 1))
+    order = np.argsort(which.ravel(), kind="stable")
+    parts = np.split(order, np.searchsorted(which.ravel()[order], np.arange(1, len(pairs))))
     taken = {text.strip('"').upper() for text in names.values()}
     free = (text for k in count(1) if (text := f"{_MADE}{k}").upper() not in taken)
     exact = {mesh.bar_groups[name].tobytes(): text for name, text in names.items()}
-    for number, (area, m) in enumerate(pairs.tolist()):
-        if not area > 0.0:
-            continue
-        members = order[starts[number] : starts[number + 1]]
+    for (area, m), members in zip(pairs.tolist(), parts):
         text = exact.get(members.tobytes())
-        if text is None:
+        if text is None and area > 0.0:
             text = next(free)
             yield from _set_lines(f"*ELSET, ELSET={text}, INTERNAL", members)
         of = f", MATERIAL={_quoted(materials[int(m)])}" if m >= 0 else ""
-        yield from (f"*SOLID SECTION, ELSET={text}{of}", f"{area!r},")
+        yield from (f"*SOLID SECTION, ELSET={text}{of}", f"{area!r},") if area > 0.0 else ()
 
 
 def _material_lines(name: str, keys: dict[str, Any]) -> Iterator[str]:

@@ -34,7 +34,8 @@ def read(path: Path, fields: Collection[str] | None = None) -> WholeMesh:
     """
     try:
         # whole numbers of any length, of which the longest are infinite
-        found = list(_structures(json.loads(path.read_bytes(), parse_int=_whole)))
+        content = json.loads(path.read_bytes(), parse_int=lambda text: int(text) if len(text) < 19 else float(text))
+        found = list(_structures(content))
     except (ValueError, RecursionError) as error:
         raise InputError(f"{path}: is not JSON: {error}") from None
     if not found:
@@ -106,10 +107,6 @@ def _place(kind: str, key: str, node: dict[str, Any]) -> list[float]:
     return [float(value) for _, value in found]
 
 
-def _whole(text: str) -> float:
-    return int(text) if len(text) < 19 else float(text)
-
-
 def _with_defaults(
     data: dict[str, Any], names: Sequence[str], rows: Collection[Mapping[str, Any]]
 ) -> list[dict[str, Any]]:
@@ -121,11 +118,10 @@ def _attributes(rows: list[dict[str, Any]], fields: dict[str, Any], groups: dict
     """Add attributes that all rows have to fields and groups; yield the names of others."""
     for key in dict.fromkeys(key for row in rows for key in row):
         values, name = [row.get(key) for row in rows], key.replace("/", "_")
-        if all(value is None or isinstance(value, bool) for value in values) and any(
-            value is not None for value in values
-        ):
+        kinds = {type(value) for value in values} - {type(None)}
+        if kinds == {bool}:
             groups[name] = np.flatnonzero([bool(value) for value in values])
         elif all(isinstance(value, int | float) for value in values):
             fields[name] = np.array(values, np.float64)
-        elif any(value is not None for value in values):
+        elif kinds:
             yield key

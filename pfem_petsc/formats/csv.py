@@ -159,11 +159,10 @@ def read(path: Path, fields: Collection[str] | None = None) -> WholeMesh:
     mesh.warnings += bars.units([place for _, place in bars.others([])], remedy)
     used = [nodes.place(names) for names in (*_AXES, _GROUPS)]
     mesh.node_fields, texts = nodes.fields([*used, ids, *nodes.places(chain(*_NODE_IDS))])
-    if texts or (used[2] is None and mesh.node_fields):
-        left = [f"left out columns {', '.join(map(repr, texts))}, which have other text than numbers"] * bool(texts)
-        flat = ["has no column z: all nodes have z = 0"] * (used[2] is None)
-        known = f"known are x, y, z, groups, and for ids {_KNOWN_IDS}; others are fields"
-        mesh.warnings.append(f"{of_nodes}: {'; '.join([*left, *flat, known])}")
+    left = [f"left out columns {', '.join(map(repr, texts))}, which have other text than numbers"] * bool(texts)
+    flat = ["has no column z: all nodes have z = 0"] * (used[2] is None)
+    known = f"known are x, y, z, groups, and for ids {_KNOWN_IDS}; others are fields"
+    mesh.tell(texts or (flat and mesh.node_fields), f"{of_nodes}: {'; '.join([*left, *flat, known])}")
     numbered = [place for place in bars.places(_BAR_IDS) if len(set(bars.columns[place])) == bars.n]
     mesh.bar_fields, texts = bars.fields([*pair, bars.place(_GROUPS), *numbered])
     mesh.warnings += [f"{of_bars}: left out column {name!r}, which has text other than numbers" for name in texts]

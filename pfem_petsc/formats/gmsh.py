@@ -11,7 +11,6 @@ import codecs
 import re
 from collections.abc import Collection, Iterable, Iterator
 from io import BytesIO
-from itertools import chain
 from pathlib import Path
 from typing import NamedTuple
 
@@ -88,13 +87,11 @@ def read(path: Path, fields: Collection[str] | None = None) -> WholeMesh:
             name, own, values = _data(f"{path}: section ${kind}", payload, layout)
             order = np.argsort(own, kind="stable")
             place, there = places_of(own[order], tags)
-            where = f"{path}: section ${kind} {name!r} is left out"
-            if values is None:
-                mesh.warnings.append(f"{where}: a field has a name without slash and one component")
-            elif there.all() and not np.isnan(values).any():
-                found[name] = values[order[place], 0]
-            else:
-                mesh.warnings.append(f"{where}: it does not have a value for each {what}")
+            whole = values is not None and there.all() and not np.isnan(values).any()
+            why = f"it does not have a value for each {what}"
+            why = "a field has a name without slash and one component" if values is None else why
+            mesh.tell(not whole, f"{path}: section ${kind} {name!r} is left out: {why}")
+            found |= {name: values[order[place], 0]} if whole else {}
     return mesh
 
 
@@ -436,14 +433,10 @@ def _lines(mesh: WholeMesh) -> Iterator[str]:
         yield from (f"0 {node + 1} 15 1", f"{tag} {node + 1}")
     yield "$EndElements"
     for kind, fields in (("ElementData", mesh.bar_fields), ("NodeData", mesh.node_fields)):
-        yield from chain.from_iterable(_data_section(kind, name, values) for name, values in fields.items())
-
-
-def _data_section(kind: str, name: str, values: np.ndarray) -> Iterator[str]:
-    """Return a section of data: name, time 0, step 0, one component, a value for each bar or node."""
-    yield from (f"${kind}", "1", f'"{_quoted(name)}"', "1", "0.0", "3", "0", "1", str(len(values)))
-    yield from (f"{tag} {value!r}" for tag, value in enumerate(values.tolist(), 1))
-    yield f"$End{kind}"
+        for name, values in fields.items():  # time 0, step 0, one component, a value for each bar or node
+            yield from (f"${kind}", "1", f'"{_quoted(name)}"', "1", "0.0", "3", "0", "1", str(len(values)))
+            yield from (f"{tag} {value!r}" for tag, value in enumerate(values.tolist(), 1))
+            yield f"$End{kind}"
 
 
 def _combinations(groups: dict[str, np.ndarray], n: int) -> tuple[list[list[int]], np.ndarray]:

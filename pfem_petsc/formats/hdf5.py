@@ -11,7 +11,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from math import prod
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from mpi4py import MPI
@@ -34,15 +34,6 @@ _FAILURES = (OSError, RuntimeError, KeyError, ValueError, TypeError, AttributeEr
 """What h5py and NumPy raise for a damaged file."""
 
 
-class _Content(NamedTuple):
-    """Sizes, names of groups of nodes and bars, and of their fields."""
-
-    n_nodes: int
-    n_bars: int
-    groups: dict[str, list[str]]
-    fields: dict[str, list[str]]
-
-
 def read_on(path: Path, comm: MPI.Comm, fields: Mapping[str, str] | None = None) -> MeshSlab:
     """Return this rank's slab of the mesh in an HDF5 file, with the named fields; None: with all. Collective; no rank
     reads more than its part at a time.
@@ -52,13 +43,12 @@ def read_on(path: Path, comm: MPI.Comm, fields: Mapping[str, str] | None = None)
     InputError
         On all ranks, naming the dataset, if the file is not HDF5 or its datasets are not those of a mesh.
     """
-    content = on_root(comm, _content, path, fields)
-    check_memory(content.n_nodes, str(path))
-    n_nodes, n_bars = content.n_nodes, content.n_bars
+    n_nodes, n_bars, groups, known = on_root(comm, _content, path, fields)
+    check_memory(n_nodes, str(path))
     first_node, last_node = slab_range(n_nodes, comm.rank, comm.size)
     first, last = slab_range(n_bars, comm.rank, comm.size)
     slab = MeshSlab(n_nodes, n_bars, first_node, np.empty((0, 3)), first, np.empty((0, 2), int), source=str(path))
-    wanted = {kind: [n for n in names if fields is None or n in fields] for kind, names in content.fields.items()}
+    wanted = {kind: [n for n in names if fields is None or n in fields] for kind, names in known.items()}
     # Every rank opens the file read-only: this needs no MPI driver, which a serial h5py lacks.
     with agreed(comm), _opened(path) as file:
         slab.points = _share_of(file["points"], first_node, last_node)
@@ -69,12 +59,10 @@ def read_on(path: Path, comm: MPI.Comm, fields: Mapping[str, str] | None = None)
             if piece.min() < limits.min or piece.max() > limits.max:
                 piece = np.where((piece < 0) | (piece >= n_nodes), -1, piece)
             slab.bars[start - first : stop - first] = piece
-        slab.bar_fields = {name: _share_of(file[f"bar_fields/{name}"], first, last) for name in wanted["bar_fields"]}
-        slab.node_fields = {
-            name: _share_of(file[f"node_fields/{name}"], first_node, last_node) for name in wanted["node_fields"]
-        }
+        for kind, *share in (("bar_fields", first, last), ("node_fields", first_node, last_node)):
+            setattr(slab, kind, {name: _share_of(file[f"{kind}/{name}"], *share) for name in wanted[kind]})
     for kind, n in (("node_groups", n_nodes), ("bar_groups", n_bars)):
-        for name in content.groups[kind]:
+        for name in groups[kind]:
             getattr(slab, kind)[name] = _members(path, f"{kind}/{name}", n, comm)
     return slab
 
@@ -97,8 +85,11 @@ def _opened(path: Path) -> Iterator[Any]:
             raise InputError(f"{path}: cannot be read ({error}); the file may be damaged: write it again") from None
 
 
-def _content(path: Path, fields: Mapping[str, str] | None) -> _Content:
-    """Check shape and type of every dataset, and that the fields are there."""
+def _content(
+    path: Path, fields: Mapping[str, str] | None
+) -> tuple[int, int, dict[str, list[str]], dict[str, list[str]]]:
+    """Check shape and type of every dataset, and that the fields are there; return the numbers of nodes and bars, and
+    the names of groups and fields of both."""
     import h5py
 
     with _opened(path) as file:
@@ -133,7 +124,7 @@ def _content(path: Path, fields: Mapping[str, str] | None) -> _Content:
             fits = [name for name, data in sets.items() if isinstance(data, h5py.Dataset) and data.shape == (n,)]
             known[kind] = [name for name in fits if sets[name].dtype.kind in "fiu"]
     check_fields(path, fields, {*known["bar_fields"], *known["node_fields"]})
-    return _Content(counts[0], counts[1], groups, known)
+    return *counts, groups, known
 
 
 def _pieces(first: int, last: int) -> Iterator[tuple[int, int]]:
@@ -162,9 +153,8 @@ def _members(path: Path, name: str, n: int, comm: MPI.Comm) -> np.ndarray:
     for start in range(begin, begin - (-total // comm.size), PIECE):
         with agreed(comm), _opened(path) as file:
             numbers = file[name][min(start, end) : min(start + PIECE, end)].astype(np.int64)
-            outside = numbers[(numbers < 0) | (numbers >= n)]
-            if len(outside):
-                raise InputError(f"{path}: /{name} has member {outside[0]}, but numbers go from 0 to {n - 1}")
+            for outside in numbers[(numbers < 0) | (numbers >= n)][:1]:
+                raise InputError(f"{path}: /{name} has member {outside}, but numbers go from 0 to {n - 1}")
         mask[Router(comm, slab_of(numbers, n, comm.size)).send(numbers) - first] = True
     return first + np.flatnonzero(mask)
 

@@ -181,8 +181,7 @@ def _add_sections(path: Path, mesh: WholeMesh, deck: Any, bars: list[Any], told:
     told(bare, f"{', '.join(sorted(bare))} have the area 0: a case needs a positive one")
     told(without, f"{without} bars have a property that is not read or not there: they have no section")
     told(mass, f"left out the nonstructural mass of {mass} bars")
-    if (area > 0.0).all():
-        mesh.bar_fields["area"] = area
+    mesh.bar_fields |= {"area": area} if (area > 0.0).all() else {}
 
 
 def _mass_scale(deck: Any) -> float:
@@ -278,10 +277,9 @@ class _Conditions:
             free = int((~held[:, axis]).sum())
             self._told(free, f"the case holds {free} nodes of a flat truss along {'xyz'[axis]}, as AUTOSPC does")
             held[:, axis] = True
-        moving = {"interpolation": "linear"}
         return {
             name: {"node_set": name, "fix": _axes(row)}
-            | ({"motion": [[0.0] * 4, [1.0, *row[3:]]], **moving} if any(row[3:]) else {})
+            | ({"motion": [[0.0] * 4, [1.0, *row[3:]]], "interpolation": "linear"} if any(row[3:]) else {})
             for row, name in self._tables(np.hstack([held, moved]), lambda row: f"fixed_{_axes(row)}")
         }
 
@@ -317,23 +315,22 @@ class _Conditions:
 
     def _load_tables(self, parts: list[tuple[int, float]]) -> dict[str, dict[str, Any]]:
         forces, gravity, others = np.zeros((len(self._labels), 3)), np.zeros(3), 0
-        for number, factor in parts:
-            for card in self._deck.loads.get(number, []):
-                if card.type == "GRAV":
-                    gravity += factor * card.scale * np.nan_to_num(self._vector(card.cid, card.N, "GRAV"))
-                    continue
-                i = self._at.get(card.node, -1)
-                others += i < 0
-                if card.type == "FORCE":
-                    direction = self._vector(card.cid, card.xyz, f"FORCE at GRID {card.node}")
-                else:  # along the line of two nodes, or across the plane of two lines
-                    first = ("g1", "g2") if card.type == "FORCE1" else ("g1", "g2", "g3", "g4")
-                    place = [self._deck.nodes[getattr(card, key)].get_position() for key in first]
-                    across = [b - a for a, b in zip(place[::2], place[1::2])]
-                    direction = across[0] if len(across) == 1 else np.cross(*across)
-                    direction = direction / np.linalg.norm(direction)
-                if i >= 0:
-                    forces[i] += np.nan_to_num(factor * card.mag * direction)
+        for card, factor in [(card, factor) for number, factor in parts for card in self._deck.loads.get(number, [])]:
+            if card.type == "GRAV":
+                gravity += factor * card.scale * np.nan_to_num(self._vector(card.cid, card.N, "GRAV"))
+                continue
+            i = self._at.get(card.node, -1)
+            others += i < 0
+            if card.type == "FORCE":
+                vector = card.mag * self._vector(card.cid, card.xyz, f"FORCE at GRID {card.node}")
+            else:  # along the line of two nodes, or across the plane of two lines
+                first = ("g1", "g2") if card.type == "FORCE1" else ("g1", "g2", "g3", "g4")
+                place = [self._deck.nodes[getattr(card, key)].get_position() for key in first]
+                across = [b - a for a, b in zip(place[::2], place[1::2])]
+                vector = across[0] if len(across) == 1 else np.cross(*across)
+                vector = card.mag * vector / np.linalg.norm(vector)
+            if i >= 0:
+                forces[i] += np.nan_to_num(factor * vector)
         self._told(others, f"left out {others} forces where no bar ends")
         loads = {name: {"node_set": name, "force": force} for force, name in self._tables(forces, lambda _: "loaded")}
         return {"load": loads, "gravity": {"gravity": {"acceleration": gravity.tolist()}} if gravity.any() else {}}

@@ -9,9 +9,10 @@ from __future__ import annotations
 import re
 import sys
 from collections import Counter
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
+from types import MappingProxyType
 from typing import NamedTuple
 
 import numpy as np
@@ -28,12 +29,14 @@ class _Polygons(NamedTuple):
 
     corners: np.ndarray
     offsets: np.ndarray
+    groups: Mapping[str, list[int]] = MappingProxyType({})
+    """Numbers of faces or polylines by name."""
 
     @classmethod
-    def of(cls, rows: list[list[int]]) -> _Polygons:
+    def of(cls, rows: list[list[int]], groups: dict[str, list[int]]) -> _Polygons:
         """Return them from the corners of each."""
         corners = [corner for row in rows for corner in row]
-        return cls(np.array(corners, np.int64), np.cumsum([0, *map(len, rows)]))
+        return cls(np.array(corners, np.int64), np.cumsum([0, *map(len, rows)]), groups)
 
     def sides(self, closed: bool) -> tuple[np.ndarray, np.ndarray]:
         """Return the ends (n, 2) of all sides, of faces (``closed``) or polylines, and whose they are (n,)."""
@@ -53,9 +56,7 @@ class _Content:
     points: np.ndarray
     """(n, 3)."""
     faces: _Polygons
-    lines: _Polygons = field(default_factory=lambda: _Polygons.of([]))
-    face_groups: dict[str, list[int]] = field(default_factory=dict)
-    line_groups: dict[str, list[int]] = field(default_factory=dict)
+    lines: _Polygons = field(default_factory=lambda: _Polygons.of([], {}))
     node_fields: dict[str, np.ndarray] = field(default_factory=dict)
     bar_fields: dict[str, np.ndarray] = field(default_factory=dict)
     left: list[str] = field(default_factory=list)
@@ -73,18 +74,16 @@ def read(path: Path, fields: Collection[str] | None = None) -> WholeMesh:
     content = _READERS[path.suffix.lower()](path)
     if path.suffix.lower() == ".stl":
         content = _joined(content)
-    groups, n, first = content.line_groups, len(content.points), content.first
-    ends, owner = content.lines.sides(closed=False)
-    faces = int(np.count_nonzero(np.diff(content.faces.offsets) > 1))
-    of_faces = len(ends) == 0
-    if of_faces:
-        (ends, owner), groups = content.faces.sides(closed=True), content.face_groups
+    n, first, faces = len(content.points), content.first, int(np.count_nonzero(np.diff(content.faces.offsets) > 1))
+    of_faces = not (np.diff(content.lines.offsets) > 1).any()
+    chosen = content.faces if of_faces else content.lines
+    ends, owner = chosen.sides(closed=of_faces)
     if len(ends) == 0:
         raise InputError(f"{path}: has neither lines nor faces, whose edges would be bars")
     refused = f"{path}: there is no point ", f": the file has {n}, numbered from {first}"
     bars = whole_numbers(ends + first, first, first + n, *refused) - first
     bars, number = edges(bars) if of_faces else (bars, np.arange(len(bars)))
-    members = {name: np.unique(number[np.isin(owner, own)]) for name, own in groups.items()}
+    members = {name: np.unique(number[np.isin(owner, own)]) for name, own in chosen.groups.items()}
     mesh = WholeMesh(content.points, bars, bar_groups={name: own for name, own in members.items() if len(own)})
     mesh.node_fields, mesh.bar_fields = content.node_fields, content.bar_fields
     mesh.tell(of_faces, f"{path}: has no lines: the {len(bars)} edges of its {faces} faces are bars")
@@ -103,7 +102,7 @@ def read_faces(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         As :func:`read`.
     """
     content = _READERS[path.suffix.lower()](path)
-    return content.points, *content.faces
+    return content.points, content.faces.corners, content.faces.offsets
 
 
 # ---- Wavefront OBJ
@@ -147,9 +146,8 @@ def _obj(path: Path) -> _Content:
             expected = "three numbers" if word == "v" else "the numbers of points that precede it"
             raise InputError(f"{path}: line {number}: {line[:60]!r}: expected {expected}") from None
     left = [f"{n} {word}" for word, n in other.items()]
-    faces, lines = _Polygons.of(rows["f"]), _Polygons.of(rows["l"])
-    points = np.array(points).reshape(-1, 3)
-    return _Content(points, faces, lines, groups["f"], groups["l"], left=left, first=1)
+    faces, lines = (_Polygons.of(rows[kind], groups[kind]) for kind in "fl")
+    return _Content(np.array(points).reshape(-1, 3), faces, lines, left=left, first=1)
 
 
 # ---- PLY

@@ -251,8 +251,7 @@ def _assembled(path: Path, model: _Model) -> WholeMesh:
     mesh = WholeMesh(np.concatenate(points), np.concatenate(bars), *groups)
     one, two = np.concatenate(radii).T
     area = np.where(one == two, np.pi * one * one, np.pi / 3.0 * (one * one + one * two + two * two))
-    if (area > 0.0).all():
-        mesh.bar_fields["area"] = area
+    mesh.bar_fields |= {"area": area} if (area > 0.0).all() else {}
     cones = int((one != two).sum())
     mesh.warnings = [f"{path}: requires the extension {uri}, which is not read" for uri in model.not_read]
     mesh.tell(cones, f"{path}: {cones} beams whose radii differ have a constant area, with the same volume")
@@ -314,10 +313,11 @@ def _model_text(mesh: WholeMesh, radius: np.ndarray) -> Iterator[str]:
     same = (radius == radius[0]).all()
     radii = repeat("") if same else (f' r1="{r!r}" r2="{r!r}"' for r in radius.tolist())
     yield "".join(f'<b:beam v1="{a}" v2="{b}"{r}/>\n' for (a, b), r in zip(mesh.bars.tolist(), radii)) + "</b:beams>\n"
-    if mesh.bar_groups:
-        yield "<b:beamsets>\n"
-        for number, (name, members) in enumerate(mesh.bar_groups.items()):
-            yield f'<b:beamset name={quoteattr(name)} identifier="set{number}">\n'
-            yield "".join(f'<b:ref index="{i}"/>\n' for i in members.tolist()) + "</b:beamset>\n"
-        yield "</b:beamsets>\n"
+    sets = [
+        f'<b:beamset name={quoteattr(name)} identifier="set{number}">\n'
+        + "".join(f'<b:ref index="{i}"/>\n' for i in members.tolist())
+        + "</b:beamset>\n"
+        for number, (name, members) in enumerate(mesh.bar_groups.items())
+    ]
+    yield from ("<b:beamsets>\n", *sets, "</b:beamsets>\n") if sets else ()
     yield '</b:beamlattice></mesh></object></resources>\n<build><item objectid="1"/></build>\n</model>\n'

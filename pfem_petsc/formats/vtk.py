@@ -22,6 +22,7 @@ import subprocess
 import sys
 from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from xml.sax.saxutils import escape
@@ -59,8 +60,8 @@ def read(path: Path, fields: Collection[str] | None = None) -> WholeMesh:
     from ..mesh.whole import WholeMesh
 
     command = [sys.executable, "-P", "-m", __name__, str(path.resolve())]
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(p for p in sys.path if p)}
-    done = subprocess.run(command, env=environment, capture_output=True, check=False)
+    path_of_modules = {"PYTHONPATH": os.pathsep.join(p for p in sys.path if p)}
+    done = subprocess.run(command, env=os.environ | path_of_modules, capture_output=True, check=False)
     if done.returncode == _REFUSED:
         raise InputError(f"{path}: {done.stdout.decode(errors='replace').strip()}")
     if done.returncode < 0:
@@ -184,9 +185,8 @@ def _arrays(grid: Any) -> Iterator[tuple[str, Any]]:
         raise ValueError("lines that do not have two ends; a bar has two")
     if first.min() < 0 or (first + size).max() > len(ends):
         raise ValueError("lines whose nodes do not exist: a damaged file")
-    wrong = ends[(ends < 0) | (ends >= n_nodes)]
-    if len(wrong):
-        raise ValueError(f"there is no point {wrong[0]}, at which a cell ends: the file has {n_nodes}, numbered from 0")
+    for wrong in ends[(ends < 0) | (ends >= n_nodes)][:1]:
+        raise ValueError(f"there is no point {wrong}, at which a cell ends: the file has {n_nodes}, numbered from 0")
     # a line of several points is as many bars less one, a face as many as it has corners: the cell of each bar, and
     # which of its points come first and second
     count = size if of_faces else size - 1
@@ -256,13 +256,11 @@ def write(path: Path, mesh: WholeMesh) -> None:
     writer.SetFileName(str(path))
     if legacy:
         writer.SetFileTypeToBinary()
-    writer.SetInputData(grid_of(mesh, str if legacy else _escaped, polygonal=path.suffix.lower() == ".vtp"))
+    # VTK writes names into XML as they are
+    named = str if legacy else partial(escape, entities={'"': "&quot;", "\t": "&#9;", "\n": "&#10;", "\r": "&#13;"})
+    writer.SetInputData(grid_of(mesh, named, polygonal=path.suffix.lower() == ".vtp"))
     if not writer.Write() or not path.is_file():
         raise InputError(f"{path}: VTK could not write the file; is there room?")
-
-
-def _escaped(name: str) -> str:
-    return escape(name, {'"': "&quot;", "\t": "&#9;", "\n": "&#10;", "\r": "&#13;"})  # VTK writes names as they are
 
 
 def grid_of(mesh: WholeMesh, named: Callable[[str], str] = str, polygonal: bool = False) -> pyvista.DataSet:

@@ -260,7 +260,6 @@ def _arranged(
     borrowed, kind = ends[:, 0] >= n_owned, None
     if borrowed.any() or (len(section) and section.min() != section.max()) or section[:1].any():
         kind = 2 * section + borrowed
-    del borrowed
     order = bar_order(ends, kind, n_local)
     counts = np.bincount(kind) if kind is not None else np.array([len(ends)])
     counts = np.append(counts, np.zeros(len(counts) % 2, counts.dtype)).reshape(-1, 2)

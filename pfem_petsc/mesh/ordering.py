@@ -173,10 +173,7 @@ def _spacing(extents: np.ndarray, n: int) -> float:
     low = high / n
     for _ in range(60):
         middle = low**0.5 * high**0.5
-        if np.prod(extents / middle + 1.0) > n:
-            low = middle
-        else:
-            high = middle
+        low, high = (middle, high) if np.prod(extents / middle + 1.0) > n else (low, middle)
     return high
 
 
@@ -213,9 +210,8 @@ def bar_order(bars: np.ndarray, group: np.ndarray | None, n_local: int) -> np.nd
         place = np.argsort(key, kind="stable")
         order[first:last] = rows[place]
         scattered = _scattered(key[place], number, LEAST_RUN)
-        if len(scattered):
-            irregular += np.count_nonzero(np.isin(number, scattered))
-            short.append((first, last, scattered))
+        irregular += np.count_nonzero(np.isin(number, scattered))
+        short += [(first, last, scattered)] * bool(len(scattered))
     if irregular <= FEW * len(bars):
         return order
     for first, last, scattered in short:
@@ -249,8 +245,7 @@ def _places(bars: np.ndarray, block: np.ndarray) -> tuple[np.ndarray, np.ndarray
 def _scattered(key: np.ndarray, block: np.ndarray, least: float) -> np.ndarray:
     """Return the blocks whose runs of constant offset have fewer than ``least`` bars on average; all keys sorted."""
     fresh = np.diff(key, prepend=-2) != 1
-    last = int(block[-1]) + 1 if len(block) else 0
-    return np.flatnonzero(np.bincount(block, minlength=last) < least * np.bincount(block[fresh], minlength=last))
+    return np.flatnonzero(np.bincount(block) < least * np.bincount(block[fresh], minlength=block[-1] + 1))
 
 
 UNEVEN = 1.1
@@ -371,7 +366,6 @@ def _adjacency(slab: MeshSlab, comm: MPI.Comm) -> tuple[np.ndarray, np.ndarray]:
         ends = Router(comm, slab_of(ends[:, 0], slab.n_nodes, comm.size)).send(ends)
         parts.append((ends[:, 0] - slab.first_node) * slab.n_nodes + ends[:, 1])
     node, neighbour = np.divmod(np.unique(np.concatenate([np.empty(0, np.int64), *parts])), slab.n_nodes)
-    del parts
     rows = np.zeros(len(slab.points) + 1, PETSc.IntType)
     rows[1:] = np.cumsum(np.bincount(node, minlength=len(slab.points)))
     return rows, neighbour.astype(PETSc.IntType)

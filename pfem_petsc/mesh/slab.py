@@ -284,7 +284,6 @@ def _members(source: str, kind: str, name: str, values: ArrayLike, n: int) -> np
             f"{where} has shape {array.shape} and type {array.dtype}; expected a list of numbers from 0, or ({n},) "
             "booleans"
         )
-    wrong = array[(array < 0) | (array >= n)]
-    if len(wrong):
-        raise InputError(f"{where} has member {wrong[0]}, but numbers go from 0 to {n - 1}")
+    for wrong in array[(array < 0) | (array >= n)][:1]:
+        raise InputError(f"{where} has member {wrong}, but numbers go from 0 to {n - 1}")
     return np.unique(array.astype(np.int64))

@@ -160,16 +160,15 @@ def merged(meshes: Sequence[WholeMesh], tolerance: float | None = None) -> tuple
         setattr(together, kind, groups)
     for kind in ("bar_fields", "node_fields"):
         fields = [getattr(mesh, kind) for mesh in meshes]
-        for name in sorted(set().union(*fields)):
-            if all(name in own for own in fields):
-                getattr(together, kind)[name] = np.concatenate([own[name] for own in fields])
-            else:
-                done.append(f"field {name} left out: not all files have it")
+        common = set(fields[0]).intersection(*fields)
+        setattr(together, kind, {name: np.concatenate([own[name] for own in fields]) for name in sorted(common)})
+        others = sorted(set().union(*fields) - common)
+        done += [f"field {name} left out: not all files have it" for name in others]
     for mesh in meshes:
         together.warnings += mesh.warnings
         for table, rows in mesh.tables.items():
-            if table == "analysis" and table in together.tables:
-                rows = together.tables[table]  # that of the first file that has one
+            # the analysis is that of the first file that has one
+            rows = together.tables.get(table, rows) if table == "analysis" else rows
             into: dict[str, Any] = together.tables.setdefault(table, {})
             differing = [name for name, keys in rows.items() if into.setdefault(name, keys) != keys]
             told = "differs from that of an earlier file, which is kept"
@@ -192,8 +191,7 @@ def refined(mesh: WholeMesh, n: int) -> WholeMesh:
     between = old + np.arange(count * (n - 1)).reshape(count, n - 1)
     chain = np.concatenate([mesh.bars[:, :1], between, mesh.bars[:, 1:]], axis=1)
     bars = np.stack([chain[:, :-1], chain[:, 1:]], axis=2).reshape(-1, 2)
-    parts = np.arange(n)
-    groups = {name: (np.asarray(own)[:, None] * n + parts).ravel() for name, own in mesh.bar_groups.items()}
+    groups = {name: (np.asarray(own)[:, None] * n + np.arange(n)).ravel() for name, own in mesh.bar_groups.items()}
     unknown = np.full(len(inner), np.nan)
     return replace(
         mesh,

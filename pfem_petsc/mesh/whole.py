@@ -162,17 +162,9 @@ def tables_of(mesh: WholeMesh) -> tuple[dict[str, Any], list[str]]:
     return {"node_set": node_sets, "material": materials, "section": sections, **conditions}, made
 
 
-def _probes(mesh: WholeMesh) -> list[dict[str, str]]:
-    """Return probes for node sets with loads or motions, but for large ones: each node has columns of the history."""
-    moved = [keys for keys in mesh.tables.get("support", {}).values() if len(keys) > 2]
-    names = dict.fromkeys(keys["node_set"] for keys in (*mesh.tables.get("load", {}).values(), *moved))
-    return [{"name": name, "node_set": name} for name in names if len(mesh.node_groups[name]) <= _PROBED]
-
-
 def skeleton(mesh: WholeMesh, file: Path, case: Path) -> str:
     """Return the text of a case file at ``case`` for a mesh file, which can be checked and run."""
     tables, made = tables_of(mesh)
-    relative = os.path.relpath(file.absolute(), case.absolute().parent)
     known = [name for name in _CONDITIONS if mesh.tables.get(name, {}).keys() - {PLANE}]
     analysis = mesh.tables.get("analysis", {})
     missing = "supports and loads" if analysis else "supports, loads, and the analysis"
@@ -182,13 +174,16 @@ def skeleton(mesh: WholeMesh, file: Path, case: Path) -> str:
     lines = [f"# A case for {file.name}. {told}\n", *(f"#   {key}\n" for key in made), "\n"]
     data = {
         "title": mesh.title or file.stem,
-        "mesh": {"file": relative},
+        "mesh": {"file": os.path.relpath(file.absolute(), case.absolute().parent)},
         **{name: table for name, table in tables.items() if table},
         **({} if known else {"gravity": {"acceleration": [0.0, 0.0, -9.81]}}),
         **(analysis or {"time": {"integrator": "central_differences", "step": "auto", "end": 1e-3}}),
     }
-    probes = _probes(mesh) if data.keys() & {"static", "time"} else []
-    data |= {"output": {"probe": probes}} if probes else {}
+    # each node of a probe has columns of the history
+    moved = [keys for keys in mesh.tables.get("support", {}).values() if len(keys) > 2]
+    names = dict.fromkeys(keys["node_set"] for keys in (*mesh.tables.get("load", {}).values(), *moved))
+    probes = [{"name": name, "node_set": name} for name in names if len(mesh.node_groups[name]) <= _PROBED]
+    data |= {"output": {"probe": probes}} if probes and data.keys() & {"static", "time"} else {}
     held = next(iter(tables["node_set"]), "NAME")
     example = "" if tables["node_set"] else _NODE_SET
     example += f'\n# [[support]]\n# node_set = "{held}"\n# fix = "xyz"\n'

@@ -257,13 +257,12 @@ def _kept(array: np.ndarray) -> np.ndarray:
 def _digest(slab: MeshSlab) -> str:
     """Return a digest of all arrays with their names."""
     found = hashlib.sha256()
-    for array in (slab.points, slab.bars):
-        found.update(repr(array.shape).encode())
+    arrays = [(array.shape, array) for array in (slab.points, slab.bars)]
+    for kind, named in (("node", slab.node_groups), ("bar", slab.bar_groups), ("field", slab.bar_fields)):
+        arrays += [((kind, name, array.shape), array) for name, array in named.items()]
+    for head, array in arrays:
+        found.update(repr(head).encode())
         found.update(np.ascontiguousarray(array))
-    for kind, arrays in (("node", slab.node_groups), ("bar", slab.bar_groups), ("field", slab.bar_fields)):
-        for name, array in arrays.items():
-            found.update(repr((kind, name, array.shape)).encode())
-            found.update(np.ascontiguousarray(array))
     return found.hexdigest()
 
 
@@ -323,8 +322,7 @@ def generate_on(
     truss: Truss | None = parameters.truss
     digest = parameters.digest if truss is None else truss.digest
     found = comm.allgather((digest, truss is not None and truss.points is not None))
-    if any(other != found[0][0] for other, _ in found):
-        rank = next(rank for rank, (other, _) in enumerate(found) if other != found[0][0])
+    for rank in [rank for rank, (other, _) in enumerate(found) if other != found[0][0]][:1]:
         raise InputError(
             f"mesh: the arrays of rank {rank} differ from those of rank 0: give all ranks the same arrays, or rank 0 "
             "alone, by Truss(..., comm=comm)"

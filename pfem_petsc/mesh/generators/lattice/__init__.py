@@ -67,14 +67,13 @@ def generate_on(
     InputError
         On all ranks.
     """
-    keys, surface = parameters, None
+    keys = parameters
     with agreed(comm):
         for name, key in fields.items():
             if name not in (keys.bar_fields or {}):
                 known = ", ".join(keys.bar_fields or {}) or "none"
                 raise InputError(f"{key} = {name!r}: mesh.bar_fields has no such field; it has {known}")
-    if keys.surface is not None:
-        surface = on_root(comm, read_surface, Path(keys.surface.file), keys.surface.scale)
+    surface = None if keys.surface is None else on_root(comm, read_surface, Path(keys.surface.file), keys.surface.scale)
     partial = bool(keys.missing or surface or keys.keep is not None)
     with agreed(comm):
         block = Block(fitted(keys, surface) if surface is not None else keys, plain=not partial)

@@ -238,19 +238,16 @@ def periodic_mechanisms(cell: UnitCell) -> tuple[int, int]:
     vectors = cell.vectors
     directions = vectors / np.linalg.norm(vectors, axis=1)[:, None]
     struts, strains = np.arange(len(vectors)), np.array([(0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2)])
-    waves = 0
+    free: dict[tuple[int, ...], int] = {}
     for wave in itertools.product((0, 1), repeat=3):
         rows = np.zeros((len(struts), *cell.points.shape))
         for which, sign in ((0, -1.0), (1, 1.0)):
             phase = sign * (-1.0) ** (cell.offsets[:, which] @ np.array(wave))
             np.add.at(rows, (struts, cell.ends[:, which]), phase[:, None] * directions)
-        rows = rows.reshape(len(struts), -1)
-        if any(wave):
-            waves += rows.shape[1] - np.linalg.matrix_rank(rows, tol=1e-8)
-        else:
-            rows = np.hstack([rows, vectors[:, strains[:, 0]] * directions[:, strains[:, 1]]])
-            uniform = rows.shape[1] - np.linalg.matrix_rank(rows, tol=1e-8) - 3
-    return int(uniform), int(waves)
+        strained = [] if any(wave) else [vectors[:, strains[:, 0]] * directions[:, strains[:, 1]]]
+        rows = np.hstack([rows.reshape(len(struts), -1), *strained])
+        free[wave] = rows.shape[1] - int(np.linalg.matrix_rank(rows, tol=1e-8))
+    return free.pop((0, 0, 0)) - 3, sum(free.values())
 
 
 def mechanism_warning(kind: str, cell: UnitCell) -> list[str]:

@@ -59,8 +59,7 @@ _LONGEST = 2000
 
 def can_be_variable(name: str) -> bool:
     """Whether expressions can use a name for a variable besides the coordinates."""
-    taken = name in COORDINATES or name in _CONSTANTS or name in _FUNCTIONS
-    return name.isidentifier() and not keyword.iskeyword(name) and not taken
+    return name.isidentifier() and not keyword.iskeyword(name) and name not in {*COORDINATES, *_CONSTANTS, *_FUNCTIONS}
 
 
 class Expression:

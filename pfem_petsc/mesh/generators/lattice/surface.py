@@ -163,9 +163,8 @@ class Surface:
         places: list[tuple[float, float, float]] = []
         for n, (a, b) in enumerate(zip(starts.tolist(), ends.tolist())):
             locator.IntersectWithLine(a, b, 0.0, points, cells)
-            for k in range(points.GetNumberOfPoints()):
-                lines.append(n)
-                places.append(points.GetPoint(k))
+            lines += [n] * points.GetNumberOfPoints()
+            places += map(points.GetPoint, range(points.GetNumberOfPoints()))
         line, place = np.array(lines, np.int64), np.array(places).reshape(-1, 3)
         way = ends[line] - starts[line]
         along = np.einsum("ij,ij->i", place - starts[line], way) / np.einsum("ij,ij->i", way, way)
@@ -194,10 +193,9 @@ def bodies_of(points: np.ndarray, triangles: np.ndarray, where: str) -> Surface:
         Beginning with ``where``, if bodies intersect, if a body has no inner side, or if triangles at an edge cannot be
         assigned to bodies.
     """
-    warnings: list[str] = []
     triangles, copies = _without_copies(triangles)
-    if copies:
-        warnings.append(f"{copies} triangles are in the file more than once: bodies at the same place count as one")
+    twice = f"{copies} triangles are in the file more than once: bodies at the same place count as one"
+    warnings = [twice] * bool(copies)
     parts, given = [], []
     for members, turned in _connected(points, triangles, where) if len(triangles) else ():
         own = triangles[members]

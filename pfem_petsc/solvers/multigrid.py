@@ -34,11 +34,8 @@ class CoarseMatrix:
         neighbours = (meets.T @ meets).tocsr()  # in an element
         neighbours.sort_indices()
         self._ptr, self._columns = neighbours.indptr.astype(np.int64), neighbours.indices.astype(np.int32)
-        self._agree()
-
-    def _agree(self) -> None:
-        """Send the pattern of other ranks' rows to these. Collective."""
-        grid, owned = self.grid, self.grid.n_owned
+        # the pattern of other ranks' rows is sent to these
+        owned = grid.n_owned
         rows = np.repeat(np.arange(len(grid.numbers)), np.diff(self._ptr))
         columns = grid.numbers[self._columns]
         self._n_own = int(self._ptr[owned])

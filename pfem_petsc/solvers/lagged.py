@@ -162,7 +162,6 @@ class LaggedPreconditioner:
         else:
             self.inner = AssembledPreconditioner(model, kind, symmetric, definite, matrix_free)
         self.bars = model.bars
-        self.remembers = len(model.bars.kept_names) > 0
         self.outlasts = not model.bars_vary and not model.inertia.varies
         self.place = np.zeros((mesh.n_owned, 0))
         self.history = np.zeros((len(mesh.bars), 0))
@@ -221,7 +220,7 @@ class LaggedPreconditioner:
             self.inner.make(problem, held)
             first, beyond, step = 0.0, 0.0, self.bars.step
             self.place = np.hstack([problem.x[:owned], held]) if usable else np.zeros((owned, 0))
-            if self.remembers and usable:
+            if usable:
                 self.history = self.bars.history()
         self.carried &= not due
         self._problem = problem
@@ -233,15 +232,13 @@ class LaggedPreconditioner:
         here, owned = problem.x.copy(), self.mesh.n_owned
         problem.x[:owned] = self.place[:, :3]
         self.mesh.update_ghosts(problem.x)
-        if self.remembers:
-            history = self.bars.history()
-            self.bars.put_history(self.history)
+        history = self.bars.history()
+        self.bars.put_history(self.history)
         balance = problem.balance
         with self.bars.at_step(step, balance.eta / balance.weight if balance.weight else 0.0):
             self.inner.make(problem, self.place[:, 3:])
         problem.x[:] = here
-        if self.remembers:
-            self.bars.put_history(history)
+        self.bars.put_history(history)
 
     def apply(self, x: PETSc.Vec, y: PETSc.Vec) -> None:
         """Compute y = P x for the unknowns kept, see :meth:`renew`. Collective."""

@@ -34,11 +34,8 @@ class CoarseMatrix:
         neighbours = (meets.T @ meets).tocsr()  # in an element
         neighbours.sort_indices()
         self._ptr, self._columns = neighbours.indptr.astype(np.int64), neighbours.indices.astype(np.int32)
-        self._agree()
-
-    def _agree(self) -> None:
-        """Send the pattern of other ranks' rows to these. Collective."""
-        grid, owned = self.grid, self.grid.n_owned
+        # the pattern of other ranks' rows is sent to these
+        owned = grid.n_owned
         rows = np.repeat(np.arange(len(grid.numbers)), np.diff(self._ptr))
         columns = grid.numbers[self._columns]
         self._n_own = int(self._ptr[owned])
@@ -61,7 +58,8 @@ class CoarseMatrix:
         assemble(grid.t, grid.base, grid.elements, parts, (self._ptr, self._columns), blocks)
         arrived = self._router.send(blocks[self._n_own :].reshape(-1, 9)).reshape(-1, 3, 3)
         values = np.zeros((len(self._block_columns), 3, 3))
-        np.add.at(values, self._slots, np.concatenate([blocks[: self._n_own], arrived]))
+        values[self._slots[: self._n_own]] = blocks[: self._n_own]
+        np.add.at(values, self._slots[self._n_own :], arrived)
         at = self._diagonal[:, None], np.arange(3), np.arange(3)
         values[at] = np.where(values[at] > 0.0, values[at] * (1.0 + _SHIFT), 1.0)
         size = (3 * grid.n_owned, 3 * grid.total)
@@ -72,24 +70,41 @@ class CoarseMatrix:
         return matrix
 
 
-def inverses(blocks: np.ndarray) -> np.ndarray:
-    """Return the inverses of symmetric matrices (n, 3, 3); zeros for singular ones."""
-    adjugate = np.stack([np.cross(blocks[:, i - 2], blocks[:, i - 1]) for i in range(3)], axis=2)
-    determinant = np.einsum("ni,ni->n", blocks[:, 0], adjugate[:, :, 0])[:, None, None]
-    return np.divide(adjugate, determinant, out=np.zeros_like(blocks), where=determinant > 0.0)
+@kernel
+def invert(blocks):
+    """Invert symmetric matrices (n, 6): xx, xy, xz, yy, yz, zz, in place; singular ones become zero."""
+    for k in range(len(blocks)):
+        a, b, c, d, e, f = blocks[k]
+        xx, xy, xz = d * f - e * e, c * e - b * f, b * e - c * d
+        determinant = a * xx + b * xy + c * xz
+        inverse = 1.0 / determinant if determinant > 0.0 else 0.0
+        blocks[k, 0] = xx * inverse
+        blocks[k, 1] = xy * inverse
+        blocks[k, 2] = xz * inverse
+        blocks[k, 3] = (a * f - c * c) * inverse
+        blocks[k, 4] = (b * c - a * e) * inverse
+        blocks[k, 5] = (a * d - b * b) * inverse
 
 
 @kernel
 def smooth(inverse, product, of_last, of_residual, r, z, x):
-    """Subtract the product from the residual r, and make a step z of the polynomial, all (n, 3), with the ``inverse``
-    (n, 3, 3) of the blocks on the diagonal."""
+    """Subtract the product from the residual r, and make a step z of the polynomial: all (n, 3)."""
     for k in range(len(r)):
-        for i in range(3):
-            r[k, i] -= product[k, i]
-        for i in range(3):
-            along = inverse[k, i, 0] * r[k, 0] + inverse[k, i, 1] * r[k, 1] + inverse[k, i, 2] * r[k, 2]
-            z[k, i] = of_last * z[k, i] + of_residual * along
-            x[k, i] += z[k, i]
+        r0 = r[k, 0] - product[k, 0]
+        r1 = r[k, 1] - product[k, 1]
+        r2 = r[k, 2] - product[k, 2]
+        r[k, 0] = r0
+        r[k, 1] = r1
+        r[k, 2] = r2
+        z0 = of_last * z[k, 0] + of_residual * (inverse[k, 0] * r0 + inverse[k, 1] * r1 + inverse[k, 2] * r2)
+        z1 = of_last * z[k, 1] + of_residual * (inverse[k, 1] * r0 + inverse[k, 3] * r1 + inverse[k, 4] * r2)
+        z2 = of_last * z[k, 2] + of_residual * (inverse[k, 2] * r0 + inverse[k, 4] * r1 + inverse[k, 5] * r2)
+        z[k, 0] = z0
+        z[k, 1] = z1
+        z[k, 2] = z2
+        x[k, 0] += z0
+        x[k, 1] += z1
+        x[k, 2] += z2
 
 
 _PREFIX = "pfem_coarse_"
@@ -118,7 +133,7 @@ class GridMultigrid:
         self.pattern = CoarseMatrix(self.grid)
         self.reduced = False
         owned = self.mesh.n_owned
-        self._inverse = np.zeros((owned, 3, 3))
+        self._inverse = np.zeros((owned, 6))
         self._r, self._z, self._x, self._e, self._product = (np.zeros((owned, 3)) for _ in range(5))
         self._special = np.empty(0, np.int64)
         self._turned = np.empty((0, 3, 3))
@@ -145,15 +160,17 @@ class GridMultigrid:
             diagonal[active] = problem.scale
             self._diagonal = diagonal
             return
-        blocks = full_blocks(product.blocks())
+        blocks = product.blocks()
         frames = problem.transform.frames
         at, kept = self._free_parts(active, frames.nodes)
         basis, inverse = np.tile(np.eye(3), (2, len(at), 1, 1))
         basis[np.searchsorted(at, frames.nodes)] = frames.basis
         inverse[np.searchsorted(at, frames.nodes)] = frames.inverse
         to_x = inverse @ kept
-        blocks[at] = np.swapaxes(to_x, 1, 2) @ blocks[at] @ to_x + problem.scale * (np.eye(3) - kept)
-        self._inverse = inverses(blocks)
+        full = np.swapaxes(to_x, 1, 2) @ full_blocks(blocks[at]) @ to_x + problem.scale * (np.eye(3) - kept)
+        blocks[at] = full.reshape(-1, 9)[:, [0, 1, 2, 4, 5, 8]]
+        invert(blocks)
+        self._inverse = blocks
         self._special, self._turned = at, kept @ basis
         place, turned = self.mesh.with_ghosts(at, to_x @ basis)
         self._make_coarse(problem, np.flatnonzero(place >= 0), turned)

@@ -14,6 +14,7 @@ from ..errors import InputError, NotConverged, SimulationFailure
 from ..integrators.base import Balance
 from ..mechanics.bars import StrainEnergy
 from ..mechanics.compiled import kernel
+from ..mechanics.elements import end_difference
 from ..parallel.agreement import agreed
 from ..solvers.matrix_free import add_blocks
 from ..solvers.newton import Tolerance, largest_at_node
@@ -59,6 +60,33 @@ def push(r, mass, factor, reach, v):
                 v[i, c] *= shorter
 
 
+@kernel
+def bound_stiffness(x, bars, counted, axial, stored):
+    """Replace the stiffness ``stored`` (2, b) of bars, see ``Bars.stiffnesses``, by a larger one: along the bar that of
+    the law at most, ``axial`` (b,), if that is larger, and N/l across it where it is under tension. Gives the sum of
+    N.N over the bars ``counted`` here [N2]."""
+    forces = 0.0
+    for k in range(len(bars)):
+        dx, dy, dz = end_difference(x, bars, k)
+        square, c, g = dx * dx + dy * dy + dz * dz, stored[0, k], stored[1, k]
+        forces += g * g * square if counted[k] else 0.0
+        geometric = max(g, 0.0)
+        stored[0, k] = max(max(c * square + g, axial[k]) - geometric, 0.0) / square if square > 0.0 else 0.0
+        stored[1, k] = geometric
+    return forces
+
+
+@kernel
+def bound_blocks(blocks, bound):
+    """Write upper bounds of the eigenvalues of ``blocks`` (local, 6): xx, xy, xz, yy, yz, zz, to ``bound`` (owned,)."""
+    for i in range(len(bound)):
+        xx, yy, zz = blocks[i, 0], blocks[i, 3], blocks[i, 5]
+        xy, xz, yz = abs(blocks[i, 1]), abs(blocks[i, 2]), abs(blocks[i, 4])
+        rows = max(xx + xy + xz, yy + xy + yz, zz + yz + xz)
+        squares = xx * xx + yy * yy + zz * zz + 2.0 * (xy * xy + yz * yz + xz * xz)
+        bound[i] = min(rows, squares**0.5)
+
+
 _SAFETY = 1.1  # s of the mass: bars turn and tighten between two estimates
 _ESTIMATE_EVERY = 10  # pseudo-steps
 _REACH = 0.1  # of its shortest bar: no node moves farther in a pseudo-step, so that none passes through another
@@ -102,6 +130,8 @@ class PseudoMotion:
         self._kinetic = -1.0  # its sum of the kinetic energy, negative at rest
         self._stored, self._blocks = np.zeros((2, len(mesh.bars))), np.zeros((local, 6))
         self._axial = model.bars.stiffness
+        self._counted = np.zeros(len(mesh.bars), dtype=bool)
+        self._counted[mesh.counted] = True
         reach = np.full(local, np.inf)
         np.minimum.at(reach, mesh.bars.ravel(), np.repeat(_REACH * model.bars.rest, 2))
         self._reach = reach[:owned].copy()
@@ -233,21 +263,13 @@ class PseudoMotion:
         with the larger of its present axial stiffness and that of its law at most, and with its geometric stiffness N/l
         where it is under tension.
         """
-        mesh, bars, stored, blocks = self.model.mesh, self.model.bars, self._stored, self._blocks
+        bars, stored, blocks = self.model.bars, self._stored, self._blocks
         bars.stiffnesses(self.x, 1.0, stored)
-        lengths = bars.lengths(self.x)
-        square = lengths**2
-        self._bar_forces = ((stored[1] * lengths)[mesh.counted] ** 2).sum()
-        axial = np.maximum(stored[0] * square + stored[1], self._axial)
-        np.maximum(stored[1], 0.0, out=stored[1])
-        stored[0] = 0.0
-        np.divide(np.maximum(axial - stored[1], 0.0), square, out=stored[0], where=square > 0.0)
+        self._bar_forces = bound_stiffness(self.x, bars.ends, self._counted, self._axial, stored)
         blocks[:] = 0.0
-        add_blocks(mesh.bars, self.x, stored, blocks)
-        xx, xy, xz, yy, yz, zz = np.abs(blocks[: mesh.n_owned].T)
-        rows = np.maximum(np.maximum(xx + xy + xz, yy + xy + yz), zz + yz + xz)
-        squares = xx**2 + yy**2 + zz**2 + 2.0 * (xy**2 + yz**2 + xz**2)
-        self.mass = 0.5 * _SAFETY * np.minimum(rows, np.sqrt(squares))
+        add_blocks(bars.ends, self.x, stored, blocks)
+        bound_blocks(blocks, self.mass)
+        self.mass *= 0.5 * _SAFETY
         # a node without bars has no stiffness of its own
         self.mass[self.mass == 0.0] = 1.0
 

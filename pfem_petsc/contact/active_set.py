@@ -20,7 +20,7 @@ from .transform import RowCoordinates, Transform
 from .wall_motion import Poses
 
 if TYPE_CHECKING:
-    from ..solvers.newton import StepProblem
+    from ..solvers.matrix import StepProblem
     from ..stepping.model import Model
     from .contact import Contact
 

@@ -25,8 +25,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numba.extending import register_jitable
 
-from ..columns import BAR_ENERGIES, STORED
-from .chunk_laws import STRESS, densities_row, evaluate
+from ..columns import STORED
 from .compiled import inlined
 from .materials.base import Law
 
@@ -205,53 +204,3 @@ def _mean_stress(law: Callable[..., Any], count: int) -> Callable[..., Any]:
 
 def _modulus(law: Callable[..., np.ndarray]) -> Callable[..., np.ndarray]:
     return lambda p, temperatures: law(p[_OF_LAW:], temperatures)
-
-
-def state_before_rupture(bars: Any, x: np.ndarray, bar: int) -> tuple[Any, np.ndarray, float, float]:
-    """Return the block of a bar (local index), its data (rows,), and its stress [Pa] and strain without the thermal
-    strain at positions ``x``, as if it had not broken."""
-    block = next(block for block in bars.blocks if block.start <= bar < block.stop)
-    k = bar - block.start
-    law, history = block.law, block.history[:, k : k + 1].copy()
-    history[law.rupture] = 0.0
-    length = float(np.linalg.norm(np.subtract(*x[bars.ends[bar]])))
-    shift, temperature = bars.heat[:, bar] if bars.heat.shape[1] else (0.0, 0.0)
-    strain = block.measure(length / bars.rest[bar])[0] - shift
-    if law.rate:
-        stress = history[len(law.internal) + 1, 0]
-    else:
-        stress = evaluate(law, block.parameters, strain, temperature, history)[STRESS, 0]
-    return block, history[:, 0], float(stress), float(strain)
-
-
-def release(bars: Any, x: np.ndarray, members: np.ndarray, state: float) -> np.ndarray:
-    """Remove bars (local indices) up to a share; return by how much the
-    energies of the bars counted on this rank change, in the order of :data:`~pfem_petsc.columns.BAR_ENERGIES`."""
-    change = np.zeros(len(BAR_ENERGIES))
-    for block in bars.blocks:
-        mine = members[(members >= block.start) & (members < block.stop)]
-        history = block.history.copy()
-        mine = mine[np.abs(history[block.law.rupture, mine - block.start]) < state]
-        if not len(mine):
-            continue
-        here, count = mine - block.start, block.law.rupture  # variables of the law of intact bars come first
-        law, parameters = intact(block.law, block.parameters)
-        ends = x[bars.ends[mine]]
-        stretch = np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1) / bars.rest[mine]
-        strain = np.array([block.measure(value)[0] for value in stretch])
-        shift, temperature = bars.heat[:, mine] if bars.heat.shape[1] else (0.0, 0.0)
-        rows = history[:count, here], np.zeros((len(law.rows) - count, len(mine))), history[len(block.law.rows) :, here]
-        found = evaluate(law, parameters, strain - shift, temperature, np.vstack(rows))
-        densities = found[densities_row(law) :]
-        lost = (state - np.abs(history[count, here])) * densities
-        history[count + 1 : count + 1 + len(lost), here] += lost
-        # one that has begun to break counts as broken
-        history[count, here] = np.where(history[count, here] > 0.0, state, -state)
-        for number in range(count, count + 1 + len(lost)):
-            block.put_row(number, history[number])
-        volume = np.broadcast_to(block.area, block.stop - block.start)[here] * bars.rest[mine] * (mine < block.counted)
-        for name, energy in zip(law.energies, (lost @ volume).tolist(), strict=True):
-            if name in STORED:
-                change[BAR_ENERGIES.index(name)] -= energy
-                change[BAR_ENERGIES.index("rupture_dissipation")] += energy
-    return change

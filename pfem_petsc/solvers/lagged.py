@@ -17,7 +17,7 @@ from .multigrid import GridMultigrid
 if TYPE_CHECKING:
     from ..contact.transform import RowCoordinates
     from ..stepping.model import Model
-    from .problem import StepProblem
+    from .matrix import StepProblem
 
 
 # Nodes a rank. Aggregates of fewer unknowns than rigid body modes make PETSc 3.18 fail on several ranks, and let solves

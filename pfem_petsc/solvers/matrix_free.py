@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from ..mechanics.bars import Bars
     from ..mesh.distribution import DistributedMesh
     from ..stepping.model import Model
-    from .problem import StepProblem
+    from .matrix import StepProblem
 
 
 _ALIVE: dict[int, weakref.ref] = {}

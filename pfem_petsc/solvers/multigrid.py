@@ -16,7 +16,7 @@ from .matrix_free import MatrixFreeHessian, full_blocks
 
 if TYPE_CHECKING:
     from ..stepping.model import Model
-    from .problem import StepProblem
+    from .matrix import StepProblem
 
 
 _SHIFT = 1e-8  # of the diagonal: corners that few nodes depend on may have functions that depend on each other

@@ -21,7 +21,7 @@ from .matrix_free import MatrixFreeHessian, outlive_at_exit, pass_less_often
 if TYPE_CHECKING:
     from ..mechanics.elements import BlockPattern
     from ..mesh.distribution import DistributedMesh
-    from .problem import StepProblem
+    from .matrix import StepProblem
 
 STAGNATION = 100.0
 """A residual within this many rounding errors that no longer falls has converged."""

@@ -17,8 +17,7 @@ from ..integrators.base import Balance, NoParameters, Scheme, State
 from ..parallel.agreement import agreed
 
 if TYPE_CHECKING:
-    from ..solvers.matrix import HessianMatrix
-    from ..solvers.problem import StepProblem
+    from ..solvers.matrix import HessianMatrix, StepProblem
     from ..stepping.model import Model
     from ..stepping.stepper import Stepper
 
@@ -101,7 +100,7 @@ class PathEquilibrium(Equilibrium):
 def problem_at_rest(model: Model, state: State, external: np.ndarray) -> StepProblem:
     """Return the problem of equilibrium of a state under external forces (owned, 3) [N], without walls. Collective."""
     from ..contact.transform import Transform
-    from ..solvers.problem import StepProblem
+    from ..solvers.matrix import StepProblem
 
     return StepProblem(model, state, Equilibrium().balance(state, 0.0), external, Transform(model.mesh))
 

@@ -13,10 +13,9 @@ from ..contact.transform import Transform
 from ..errors import NotConverged, SimulationFailure
 from ..solvers.lagged import Preconditioning
 from ..solvers.linear import LinearChoice, configure, is_failed_factorisation, linear_reason
-from ..solvers.matrix import HessianMatrix
+from ..solvers.matrix import HessianMatrix, StepProblem
 from ..solvers.matrix_free import outlive_at_exit
 from ..solvers.newton import STAGNATION, Tolerance
-from ..solvers.problem import StepProblem
 from .stability import Stability
 
 if TYPE_CHECKING:

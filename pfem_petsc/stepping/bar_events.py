@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from ..errors import InputError
-from ..mechanics.rupture import state_before_rupture, variable_of
+from ..mechanics.bars import state_before_rupture
+from ..mechanics.rupture import variable_of
 from ..mesh.distribution import bars_of_group
 from ..output.units import engineering
 from ..tolerances import TIME

@@ -44,7 +44,7 @@ import numpy as np
 from mpi4py import MPI
 
 from ..mechanics.compiled import kernel
-from ..solvers.problem import largest_distance
+from ..solvers.matrix import largest_distance
 
 if TYPE_CHECKING:
     from .model import Model

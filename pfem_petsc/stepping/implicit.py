@@ -20,10 +20,9 @@ from ..errors import NotConverged, SimulationFailure
 from ..integrators.base import Balance
 from ..solvers.lagged import LaggedPreconditioner
 from ..solvers.linear import LinearChoice, MassSolver, unsymmetric
-from ..solvers.matrix import HessianMatrix
+from ..solvers.matrix import HessianMatrix, StepProblem, extend, extrapolate
 from ..solvers.matrix_free import MatrixFreeHessian
 from ..solvers.newton import Forcing, NewtonSolver, Tolerance, zero_tolerance
-from ..solvers.problem import StepProblem, extend, extrapolate
 from ..tolerances import ON_BOUND
 from .guard import StepGuard
 from .stepper import AttributeOf, Solution, Stepper

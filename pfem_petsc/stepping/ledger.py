@@ -8,10 +8,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ..columns import BAR_ENERGIES, COUNTS, ENERGIES, HEAD
-from ..mechanics.bars import StrainEnergy
+from ..mechanics.bars import StrainEnergy, state_before_rupture
 from ..mechanics.elements import MEASURES
 from ..mechanics.materials.base import SMALL
-from ..mechanics.rupture import state_before_rupture
 from .impact import Impacts
 from .impulses import Impulses, NoImpulses
 from .phases import CONTACT, DAMPING, EXTERNAL, INERTIAL, INTERNAL, WORKS, numerical_dissipation, power, sum_momenta

@@ -16,8 +16,7 @@ from ..contact.contact import CarriedNodes
 from ..contact.node_walls import WallForces
 from ..errors import SimulationFailure
 from ..integrators.base import Balance, Scheme, State
-from ..mechanics.bars import StrainEnergy
-from ..mechanics.rupture import release
+from ..mechanics.bars import StrainEnergy, release
 from ..output.units import LOAD_FACTOR, Axis
 from ..output.units import TIME as AXIS
 from ..tolerances import BEYOND, ON_BOUND, TIME

@@ -9,8 +9,8 @@ from pfem_petsc import Case, Simulation, Truss
 from pfem_petsc.contact.transform import Transform
 from pfem_petsc.errors import InputError
 from pfem_petsc.solvers.linear import Demand, choose_linear
+from pfem_petsc.solvers.matrix import StepProblem
 from pfem_petsc.solvers.multigrid import GridMultigrid
-from pfem_petsc.solvers.problem import StepProblem
 
 MULTIGRID = {"linear": "multigrid", "rtol": 1e-12}
 NEWMARK = {"integrator": "newmark", "beta": 0.25, "gamma": 0.5}

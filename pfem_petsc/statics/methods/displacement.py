@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 from pydantic import model_validator
 
 from ...errors import InputError
-from .arc_length import Parameters as PathKeys
+from . import PathKeys
 
 if TYPE_CHECKING:
     from ...solvers.linear import LinearChoice

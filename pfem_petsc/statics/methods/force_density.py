@@ -7,10 +7,9 @@ Applied Mechanics and Engineering 3 (1974) 115-134). Given forces N are reached 
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING
 
-from ...case.base import PositiveFloat, PositiveInt
-from . import Increments
+from . import ForceDensityKeys
 
 if TYPE_CHECKING:
     from ...solvers.linear import LinearChoice
@@ -20,21 +19,10 @@ if TYPE_CHECKING:
 __all__ = ["Parameters", "make_stepper"]
 
 
-class Parameters(Increments):
-    """Repeated solves for given forces or lengths; the form is found in one increment."""
-
-    tolerance: PositiveFloat = 1e-9
-    """of given forces, relative to the largest, and of given lengths"""
-    max_iterations: PositiveInt = 5000
-    """number of linear solves after which a form with given forces or lengths is given up"""
-
-    step: ClassVar[float] = 1.0
-    end: ClassVar[float] = 1.0
-    smallest: ClassVar[float] = 1.0
-    largest: ClassVar[float] = 1.0
+Parameters = ForceDensityKeys
 
 
-def make_stepper(model: Model, parameters: Parameters, choice: LinearChoice) -> ForceDensityStepper:
+def make_stepper(model: Model, parameters: ForceDensityKeys, choice: LinearChoice) -> ForceDensityStepper:
     """Create the stepper of a case. Collective."""
     from ..force_density import ForceDensityStepper
 

@@ -23,6 +23,7 @@ from .transform import RowCoordinates, Transform
 from .wall_motion import Poses
 
 if TYPE_CHECKING:
+    from ..mechanics.mass import Inertia
     from ..solvers.matrix import StepProblem
     from ..stepping.model import Model
     from .constraint_set import ConstraintSet

@@ -22,7 +22,6 @@ if TYPE_CHECKING:
     from ..integrators.base import Balance
     from ..solvers.linear import LinearChoice
     from ..stepping.model import Model
-    from .methods import ForceDensityKeys
 
 _DIRECT_UP_TO = 200_000
 """Nodes up to which a factorisation is used; beyond, conjugate gradients with multigrid, if no density is negative."""

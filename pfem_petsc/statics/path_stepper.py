@@ -32,7 +32,6 @@ from .stepper import StaticStepper
 
 if TYPE_CHECKING:
     from ..stepping.model import Model
-    from .methods import PathKeys
 
 
 _UNRESOLVED = 2.0**-6  # of the first length, down to which a step is halved if a critical point is not located

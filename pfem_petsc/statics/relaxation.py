@@ -27,7 +27,6 @@ if TYPE_CHECKING:
     from ..integrators.base import State
     from ..solvers.linear import LinearChoice
     from ..stepping.model import Model
-    from .methods import RelaxationKeys
 
 
 RESIDUAL, KINETIC, SUPPORTS, WALLS, BARS, FAILED, WIDTH = range(7)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Annotated
 
 import numpy as np
-from pydantic import Field, field_validator
+from pydantic import Field
 
 from pfem_petsc.case.base import Vector3
 from pfem_petsc.contact.walls.base import BaseWall, Surface, WallKeys, direction, revolved
@@ -18,15 +18,10 @@ class Parameters(WallKeys):
 
     point: Vector3
     """Apex [m]."""
-    axis: Vector3
+    axis: Annotated[Vector3, direction("the direction of the axis")]
     """From the apex into the cone; of any length but zero."""
     half_angle: Annotated[float, Field(gt=0.0, lt=90.0)]
     """Angle between axis and surface [degrees]."""
-
-    @field_validator("axis")
-    @classmethod
-    def _has_length(cls, value: tuple[float, float, float]) -> tuple[float, float, float]:
-        return direction(value, "the direction of the axis")
 
 
 class Wall(BaseWall):

@@ -105,7 +105,14 @@ BAD = {
     "none.stl": (b"solid empty\nendsolid empty\n", "has no faces"),
     "nan.stl": (FILES["text.stl"].replace(b"vertex -1.0", b"vertex nan"), "coordinates that are not finite"),
     "points.obj": (b"v 0 0 0\nv 1 0 0\nv 0 1 0\n", "has no faces"),
-    "far.obj": (b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 9\n", "there is no point 8: the file has 3"),
+    "far.obj": (
+        b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\nf 1 2 9\n",
+        "line 5: there is no point 9: the file has 3, numbered from 1",
+    ),
+    "zero.obj": (
+        b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf 0 1 2\n",
+        "line 4: 'f 0 1 2': there is no point 0: points are numbered from 1",
+    ),
     "two.obj": (b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\nf 1 2\n", "face 1 .from 0. has 2 corners: expected 3 or more"),
     "text.obj": (b"v 0 0 zero\n", "line 1: 'v 0 0 zero': expected three numbers"),
     "early.ply": (cut("little.ply", 5), "ends early"),

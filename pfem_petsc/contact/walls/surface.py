@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Literal
 
 import numpy as np
-from pydantic import Field, ValidationInfo, model_validator
+from pydantic import ValidationInfo, model_validator
 
-from ...case.base import FileName, PositiveFloat, Vector3
+from ...case.base import Digest, FileName, PositiveFloat, Vector3
 from ...case.files import digest_of, found_file
 from ...errors import InputError
 from ...formats import read_triangles
@@ -48,7 +48,7 @@ class Parameters(WallKeys):
     """true: the front is where the file has the back"""
     thickness: PositiveFloat | None = None
     """of a surface that stops nodes from both sides [m], half of it on each; default: 1e-6 of its size"""
-    digest: Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")] | None = None
+    digest: Digest | None = None
     """SHA-256 of the content of the file, which results and checkpoints keep; default: that of the file"""
 
     @model_validator(mode="after")

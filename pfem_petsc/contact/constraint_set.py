@@ -641,8 +641,8 @@ def _find_pairs(case: Case, index: int, nodes: dict[str, np.ndarray], mesh: Dist
     twice = min((pair for pairs in comm.allgather(first_twice) for pair in pairs), default=None)
     if twice is not None:
         raise InputError(
-            f"{key}: two nodes of second are nearest to the same node of first, seen along the direction: {twice[1]} and "
-            f"{twice[2]} to {twice[0]}; correct direction, or give node sets whose nodes lie opposite each other"
+            f"{key}: two nodes of second are nearest to the same node of first, seen along the direction: {twice[1]} "
+            f"and {twice[2]} to {twice[0]}; correct direction, or give node sets whose nodes lie opposite each other"
         )
     lowest = comm.allreduce(int(nearest[nearest == numbers].min(initial=mesh.n_nodes)), op=MPI.MIN)
     if lowest < mesh.n_nodes:

@@ -46,7 +46,7 @@ REFUSED = {
     "unknown strain": (["material.steel.strain=grean"], ["material.steel.strain", "did you mean 'green'?"]),
     "unknown key": (["material.steel.young_modulu=1.0"], ["young_modulu", "did you mean 'young_modulus'?"]),
     "unknown table": (["materials.steel.density=1.0"], ["materials", "did you mean 'material'?"]),
-    "what is not there yet": (["self_contact.radius=3"], ["self_contact", "unknown key"]),
+    "what is not there yet": (["self_contact.radii=3"], ["self_contact", "unknown key"]),
     "unknown generator": (["mesh.generator=rodd"], ['mesh.generator = "rodd"', "did you mean 'rod'?"]),
     "unknown generator key": (
         ["mesh.lenght=1.0"],

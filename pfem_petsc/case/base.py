@@ -158,6 +158,9 @@ Vector3 = Annotated[tuple[Finite, Finite, Finite], listed]
 PositiveInts3 = Annotated[tuple[PositiveInt, PositiveInt, PositiveInt], listed]
 Name = Annotated[str, Field(min_length=1, pattern=r"^[^/\x00-\x1f\x7f-\x9f]+$"), AfterValidator(_no_path_of_its_own)]
 """A name that is part of a path in the result file: not empty, no slash, and not a single dot, which HDF5 skips."""
+DIGEST = r"^[0-9a-f]{64}$"
+Digest = Annotated[str, Field(pattern=DIGEST)]
+"""SHA-256 of the content of a file."""
 
 
 def _without_nul(name: str) -> str:

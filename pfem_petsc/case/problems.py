@@ -12,7 +12,7 @@ from pydantic.fields import FieldInfo
 
 from ..errors import InputError
 from ..registry import nearest
-from .base import StrictModel, WithFiles
+from .base import DIGEST, StrictModel, WithFiles
 from .files import TableFile
 from .model import CaseModel, Chosen, Family, plain_type, shape_of
 from .toml import KeyPath, key_text, short_text
@@ -88,7 +88,7 @@ class Problems:
     def _describe(self, owner: Owner, item: Any, place: Callable[[KeyPath], KeyPath]) -> None:
         where, field = place(owner.path), owner.field
         kind, value, context = item["type"], item["input"], item.get("ctx", {})
-        about = f" ({' '.join(owner.about.split()).rstrip('.')})" if owner.about else ""
+        about = f" ({_unended(owner.about)})" if owner.about else ""
         if kind == "extra_forbidden":
             text = owner.unknown(str(where[-1]))
             if owner.taker and where not in self.overridden and any(p[:-1] == where[:-1] for p in self.overridden):
@@ -189,6 +189,12 @@ def _tables_text(kind: str, owner: Owner) -> str:
     return ""
 
 
+def _unended(text: str) -> str:
+    """Return a text in one line, without the full stop at its end; an ellipsis remains."""
+    line = " ".join(text.split())
+    return line if line.endswith("...") else line.removesuffix(".")
+
+
 def _item(data: Any, key: str | int) -> Any:
     try:
         return data[key]
@@ -225,6 +231,8 @@ def _expected(kind: str, value: Any, context: Mapping[str, Any], field: FieldInf
         return SI_HINT
     if kind == "float_type" and isinstance(value, int) and not isinstance(value, bool):
         return "expected a number that fits in double precision"
+    if context.get("pattern") == DIGEST:
+        return "expected 64 hexadecimal digits, as sha256sum prints them; without this key any file is accepted"
     if kind in _SIMPLE:
         return _SIMPLE[kind]
     if kind in _BOUNDS:

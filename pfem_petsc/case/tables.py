@@ -20,6 +20,7 @@ from pydantic import (
 
 from ..errors import InputError
 from .base import (
+    Digest,
     FileName,
     Finite,
     Name,
@@ -560,7 +561,7 @@ class LoadFile(StrictModel):
     """factor of the times"""
     interpolation: Literal["linear", "smooth"] = "linear"
     """interpolation between the rows: straight lines, or a cubic spline"""
-    digest: Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")] | None = None
+    digest: Digest | None = None
     """SHA-256 of the content of the file, which results and checkpoints keep; default: that of the file"""
 
     @model_validator(mode="before")

@@ -661,12 +661,23 @@ def _find_pairs(case: Case, index: int, nodes: dict[str, np.ndarray], mesh: Dist
     points, order = np.concatenate(comm.allgather(mesh.points[first])), np.argsort(known)
     at = nearest_points(across(points[order], normal), across(mesh.points[second], normal))
     nearest = known[order[at]]
-    met = np.sort(Router(comm, slab_of(nearest, mesh.n_nodes, comm.size)).send(nearest))
-    if comm.allreduce(bool((np.diff(met) == 0).any()), op=MPI.LOR):
-        raise InputError(f"{key}: two nodes of second are nearest to the same node of first, seen along the direction")
+    router = Router(comm, slab_of(nearest, mesh.n_nodes, comm.size))
+    met, own = router.send(nearest), router.send(numbers)
+    order = np.lexsort((own, met))
+    met, own = met[order], own[order]
+    first_twice = [(met[k], own[k], own[k + 1]) for k in np.flatnonzero(np.diff(met) == 0)[:1]]
+    twice = min((pair for pairs in comm.allgather(first_twice) for pair in pairs), default=None)
+    if twice is not None:
+        raise InputError(
+            f"{key}: two nodes of second are nearest to the same node of first, seen along the direction: {twice[1]} "
+            f"and {twice[2]} to {twice[0]}; correct direction, or give node sets whose nodes lie opposite each other"
+        )
     lowest = comm.allreduce(int(nearest[nearest == numbers].min(initial=mesh.n_nodes)), op=MPI.MIN)
     if lowest < mesh.n_nodes:
-        raise InputError(f"{case.source}: contact_pair: node {lowest} is paired with itself")
+        raise InputError(
+            f"{key}: node {lowest} is paired with itself, as first {pair.first!r} and second {pair.second!r} both have "
+            "it; give node sets without common nodes"
+        )
     return PairRows(pair, np.column_stack([nearest, numbers]))
 
 

@@ -22,6 +22,11 @@ _ITERATIONS = 200
 _ROUNDED = 100.0  # moves of up to so many tolerances that do not get smaller are those of rounding
 _FULL_MOVES = 20  # Newton's method converges after a few active sets, or else alternates between some of them
 
+
+class TurnsTooFarError(SimulationFailure):
+    """A wall turns too far in a step, which whoever makes the step names. Raised on all ranks."""
+
+
 Answer = tuple[np.ndarray, Callable[[], np.ndarray] | None]
 
 
@@ -72,6 +77,7 @@ class FreeWalls:
         self.any, n = len(mine) > 0, len(mine)
         self.scheme, self.comm = scheme, comm
         self.mass = np.array([wall.mass for wall in mine], dtype=float)
+        self._names = [wall.name for wall in mine]
         self.hinged = np.array([wall.hinge is not None for wall in mine], dtype=bool)
         self.turners = np.array([i for i in range(n) if mine[i].inertia is not None], dtype=np.int64)
         heavy = np.array([wall.gravity for wall in mine], dtype=bool)
@@ -187,16 +193,21 @@ class FreeWalls:
 
         Raises
         ------
-        SimulationFailure
+        TurnsTooFarError
             On all ranks, if a wall turns too far.
         """
         if not len(self.turners):
             return self._vectors, self._slopes
+        momenta = self._scale * ways[len(self.at) :]  # their integrals
         vectors, slopes = turn_bodies(self.turns, self._scale, self.inertia, ways[len(self.at) :])
         if not np.isfinite(vectors).all():
-            raise SimulationFailure(
-                "a wall with inertia turns by more than about a radian in a step, which does not determine its motion; "
-                "reduce time.step"
+            # the rotation itself is not known: that of the angular velocity at the start of the step
+            own = np.einsum("tji,tj->ti", self.turns, momenta)
+            angles = np.linalg.norm(np.linalg.solve(self.inertia, own[:, :, None])[:, :, 0], axis=1)
+            j = int(np.argmax(np.where(np.isfinite(vectors).all(axis=1), -1.0, angles)))
+            raise TurnsTooFarError(
+                f"wall {self._names[self.turners[j]]!r} with inertia turns by about {angles[j]:.3g} rad in the step; "
+                "turns of more than about a radian in a step do not determine its motion; reduce time.step"
             )
         return vectors, slopes
 

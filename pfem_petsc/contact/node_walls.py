@@ -234,7 +234,9 @@ class NodeWalls:
         self.names = [wall.name for wall in walls]
         self.any = bool(walls)
         with agreed(mesh.comm):
-            self.walls = [made_wall(wall, mesh.points[: mesh.n_owned]) for wall in walls]
+            x, numbers = mesh.points[: mesh.n_owned], {wall.name: k for k, wall in enumerate(case.wall)}
+            keys = [f"{case.source}: wall[{numbers[wall.name]}]" for wall in walls]
+            self.walls = [made_wall(wall, x, key) for wall, key in zip(walls, keys, strict=True)]
         own = [wall.centre_of_mass for wall in walls]
         self.centres = np.array([wall.centre if at is None else at for wall, at in zip(self.walls, own, strict=True)])
         self.centres = self.centres.reshape(-1, 3)

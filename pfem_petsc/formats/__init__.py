@@ -118,9 +118,9 @@ def read_whole(path: Path, fields: Collection[str] | None = None) -> WholeMesh:
     return whole
 
 
-def read_triangles(path: Path, key: str) -> tuple[np.ndarray, np.ndarray]:
+def read_triangles(path: Path) -> tuple[np.ndarray, np.ndarray]:
     """Return points (n, 3) and the numbers (t, 3) of the corners of the triangles in a file; faces of more corners,
-    which must be convex, are divided. For one rank; messages begin with the key that names the file.
+    which must be convex, are divided. For one rank; messages do not name the file.
 
     Raises
     ------
@@ -136,13 +136,13 @@ def read_triangles(path: Path, key: str) -> tuple[np.ndarray, np.ndarray]:
         points, corners, offsets = _reader_of(path, "", "read_faces").read_faces(path)
         sizes = np.diff(offsets)
         if not sizes.size or not np.isfinite(points).all():
-            raise InputError(f"{path}: has {'coordinates that are not finite' if sizes.size else 'no faces'}")
+            raise InputError(f"has {'coordinates that are not finite' if sizes.size else 'no faces'}")
         if sizes.min() < 3:
-            raise InputError(f"{path}: face {sizes.argmin()} (from 0) has {sizes.min()} corners: expected 3 or more")
+            raise InputError(f"face {sizes.argmin()} (from 0) has {sizes.min()} corners: expected 3 or more")
         n = len(points)
-        corners = whole_numbers(corners, 0, n, f"{path}: there is no point ", f": the file has {n}, from 0")
+        corners = whole_numbers(corners, 0, n, "there is no point ", f": the file has {n}, from 0")
     except InputError as error:
-        raise InputError(f"{key}{error}") from None
+        raise InputError(str(error).removeprefix(f"{path}: ")) from None
     face = np.repeat(np.arange(len(sizes)), sizes - 2)
     second = np.arange(len(face)) + 2 * face + 1
     triangles = corners[np.stack([offsets[face], second, second + 1], axis=1)]
@@ -152,7 +152,7 @@ def read_triangles(path: Path, key: str) -> tuple[np.ndarray, np.ndarray]:
     bent = np.flatnonzero((np.einsum("ti,ti->t", areas, total) < 0.0) & (sizes[face] > 3))
     if len(bent):
         x = ", ".join(f"{value:.6g}" for value in a[bent[0]])
-        raise InputError(f"{key}{path}: the face at ({x}) in the file is not convex: divide it into triangles")
+        raise InputError(f"the face at ({x}) in the file is not convex: divide it into triangles")
     return points, triangles
 
 

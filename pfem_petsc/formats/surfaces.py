@@ -51,7 +51,7 @@ class _Polygons(NamedTuple):
 
 @dataclass
 class _Content:
-    """What is in a file; ``first`` is the number that it gives to the first point, ``left`` what is not read."""
+    """What is in a file, with points numbered from 0; ``left`` is what is not read."""
 
     points: np.ndarray
     """(n, 3)."""
@@ -60,7 +60,6 @@ class _Content:
     node_fields: dict[str, np.ndarray] = field(default_factory=dict)
     bar_fields: dict[str, np.ndarray] = field(default_factory=dict)
     left: list[str] = field(default_factory=list)
-    first: int = 0
 
 
 def read(path: Path, fields: Collection[str] | None = None) -> WholeMesh:
@@ -74,14 +73,13 @@ def read(path: Path, fields: Collection[str] | None = None) -> WholeMesh:
     content = _READERS[path.suffix.lower()](path)
     if path.suffix.lower() == ".stl":
         content = _joined(content)
-    n, first, faces = len(content.points), content.first, int(np.count_nonzero(np.diff(content.faces.offsets) > 1))
+    n, faces = len(content.points), int(np.count_nonzero(np.diff(content.faces.offsets) > 1))
     of_faces = not (np.diff(content.lines.offsets) > 1).any()
     chosen = content.faces if of_faces else content.lines
     ends, owner = chosen.sides(closed=of_faces)
     if len(ends) == 0:
         raise InputError(f"{path}: has neither lines nor faces, whose edges would be bars")
-    refused = f"{path}: there is no point ", f": the file has {n}, numbered from {first}"
-    bars = whole_numbers(ends + first, first, first + n, *refused) - first
+    bars = whole_numbers(ends, 0, n, f"{path}: there is no point ", f": the file has {n}, numbered from 0")
     bars, number = edges(bars) if of_faces else (bars, np.arange(len(bars)))
     members = {name: np.unique(number[np.isin(owner, own)]) for name, own in chosen.groups.items()}
     mesh = WholeMesh(content.points, bars, bar_groups={name: own for name, own in members.items() if len(own)})
@@ -117,6 +115,7 @@ def _obj(path: Path) -> _Content:
     groups: dict[str, dict[str, list[int]]] = {"l": {}, "f": {}}
     named: dict[str, list[str]] = {"o": [], "g": []}
     degree, other = 0, Counter[str]()
+    numbers: dict[str, list[int]] = {"l": [], "f": []}  # of the lines that rows are in
     text = path.read_text(encoding="utf-8-sig", errors="replace").replace("\\\n", " ")
     for number, line in enumerate(text.splitlines(), 1):
         word, *rest = line.partition("#")[0].split() or [""]
@@ -128,6 +127,10 @@ def _obj(path: Path) -> _Content:
                 points.append([x, y, z])
             elif word in rows:
                 ends = [int(text.partition("/")[0]) for text in rest]
+                if 0 in ends:
+                    raise InputError(
+                        f"{path}: line {number}: {line[:60]!r}: there is no point 0: points are numbered from 1"
+                    )
                 ends = [end - 1 if end > 0 else len(points) + end for end in ends]
                 if min(ends) < 0 or max(ends) > sys.maxsize:
                     raise IndexError
@@ -136,6 +139,7 @@ def _obj(path: Path) -> _Content:
                 for name in (*named["o"], *named["g"]):
                     groups[word].setdefault(name, []).append(len(rows[word]))
                 rows[word].append(ends)
+                numbers[word].append(number)
             elif word == "deg":
                 degree = int(rest[0])
             elif word in named:
@@ -147,7 +151,15 @@ def _obj(path: Path) -> _Content:
             raise InputError(f"{path}: line {number}: {line[:60]!r}: expected {expected}") from None
     left = [f"{n} {word}" for word, n in other.items()]
     faces, lines = (_Polygons.of(rows[kind], groups[kind]) for kind in "fl")
-    return _Content(np.array(points).reshape(-1, 3), faces, lines, left=left, first=1)
+    for word, polygons in (("l", lines), ("f", faces)):  # points may follow in the file
+        beyond = np.flatnonzero(polygons.corners >= len(points))
+        if len(beyond):
+            number = numbers[word][np.searchsorted(polygons.offsets, beyond[0], side="right") - 1]
+            raise InputError(
+                f"{path}: line {number}: there is no point {polygons.corners[beyond[0]] + 1}: the file has "
+                f"{len(points)}, numbered from 1"
+            )
+    return _Content(np.array(points).reshape(-1, 3), faces, lines, left=left)
 
 
 # ---- PLY

@@ -10,6 +10,7 @@ import numpy as np
 from numba import types
 
 from ..contact.explicit import OutOfReachError
+from ..contact.free_walls import TurnsTooFarError
 from ..errors import SimulationFailure
 from ..mesh.exchange import CFunction
 from ..parallel.agreement import is_alone
@@ -206,7 +207,10 @@ class WallCaller(Caller):
         state, some, bodies = stepper.state, record.nodes[: record.counts[SUSPECTS]], walls.motion.bodies
         state.time, state.contact, h = step * stepper.h, self._contact, stepper.h
         if what == MOVED:
-            self._move(step)
+            try:
+                self._move(step)
+            except TurnsTooFarError as failure:
+                raise SimulationFailure(f"{stepper.at(step + 1, (step + 1) * h)}: {failure}") from failure
         elif what == PRESSED:
             found, self._found_at = walls.room[: record.counts[FOUND]].copy(), step
             balance = replace(stepper.balance, time=(step + 1) * h)

@@ -167,9 +167,11 @@ class Plan:
 
 
 def refuse_motion(case: Case, what: str) -> None:
-    """Refuse initial velocities and treatments of impact, which ``what`` does not have."""
+    """Refuse initial velocities, restitution and treatments of impact, which ``what`` does not have."""
     if any(any(entry.velocity) or any(entry.angular_velocity) for entry in case.initial):
         raise InputError(f"{case.source}: initial: {what} has no velocities; remove the table [initial], or use [time]")
+    if not any(stage.time is not None for stage in case.editor[0].stages):
+        _refuse_restitution(case, what)
     name = case.contact.treatment
     if name == "scheme":
         return
@@ -183,6 +185,21 @@ def refuse_motion(case: Case, what: str) -> None:
     raise InputError(
         f'{case.source}: {where}contact.treatment = "{name}" treats impacts, and {what} has none; {remedy}'
     )
+
+
+def _refuse_restitution(case: Case, what: str) -> None:
+    """Refuse restitution of walls, pairs and bars, which ``what`` does not have. As tables stay in force, stages may
+    have it beside one with time."""
+    named: list[tuple[str, float]] = []
+    for kind in ("wall", "contact_pair"):
+        named += [(f"{kind} {entry.name!r}", entry.restitution) for entry in getattr(case, kind) if entry.restitution]
+    if case.self_contact is not None and case.self_contact.restitution != 1.0:
+        named.append(("self_contact", case.self_contact.restitution))
+    for key, value in named[:1]:
+        raise InputError(
+            f"{case.source}: {key}: restitution = {value:g} is of impacts, and {what} has none; remove the key, or use "
+            "[time]"
+        )
 
 
 def make_plan(model: Model, recorded: Mapping[str, Any] | None = None) -> Plan:

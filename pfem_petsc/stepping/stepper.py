@@ -5,7 +5,8 @@ the state.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -13,6 +14,7 @@ import numpy as np
 
 from ..contact.active_set import start_at_rest
 from ..contact.contact import CarriedNodes
+from ..contact.free_walls import TurnsTooFarError
 from ..contact.node_walls import WallForces
 from ..errors import SimulationFailure
 from ..integrators.base import Balance, Scheme, State
@@ -358,8 +360,9 @@ class Stepper(ABC):
         bodies.start(self.part)
         if self.scheme.solves_next_position:
             v, speeds = state.v, bodies.state.v
-            for phase in (self._set_balance, self._solve_balance, self._finish):
-                phase(state.time)
+            with self.turns_named():
+                for phase in (self._set_balance, self._solve_balance, self._finish):
+                    phase(state.time)
             self.totals_solved = self.totals()
             if model.inertia.damped:
                 self.velocity_solved = state.v
@@ -599,8 +602,9 @@ class Stepper(ABC):
 
     def _make_part(self, end: float) -> None:
         """Advance by ``part`` to the time ``end`` [s]."""
-        for phase in self._phases():
-            phase(end)
+        with self.turns_named():
+            for phase in self._phases():
+                phase(end)
 
     def _phases(self) -> tuple[Callable[[float], None], ...]:
         """Return the phases of a step, methods of the time [s] at which its part ends, in their order."""
@@ -758,6 +762,14 @@ class Stepper(ABC):
         if self.scheme.solves_next_position:  # the position solved for may belong to the next step
             step += balance.time > (step + TIME) * self.h
         return self.at(step, balance.time)
+
+    @contextmanager
+    def turns_named(self) -> Iterator[None]:
+        """Name the step of the present balance in the failure of a wall that turns too far."""
+        try:
+            yield
+        except TurnsTooFarError as failure:
+            raise SimulationFailure(f"{self.when(self.balance)}: {failure}") from failure
 
     def evaluate(self, commit: bool) -> None:
         """Evaluate internal force and energies at the state's positions; a collapsed bar becomes a fault."""

@@ -46,7 +46,7 @@ REFUSED = {
     "unknown strain": (["material.steel.strain=grean"], ["material.steel.strain", "did you mean 'green'?"]),
     "unknown key": (["material.steel.young_modulu=1.0"], ["young_modulu", "did you mean 'young_modulus'?"]),
     "unknown table": (["materials.steel.density=1.0"], ["materials", "did you mean 'material'?"]),
-    "what is not there yet": (["self_contact.radius=3"], ["self_contact", "unknown key"]),
+    "what is not there yet": (["self_contact.radii=3"], ["self_contact", "unknown key"]),
     "unknown generator": (["mesh.generator=rodd"], ['mesh.generator = "rodd"', "did you mean 'rod'?"]),
     "unknown generator key": (
         ["mesh.lenght=1.0"],
@@ -89,6 +89,11 @@ REFUSED = {
         ['wall[1].name = "stop"', "another wall has this name"],
     ),
     "wall's name with slash": (["wall.0.name=a/b"], ['wall[0].name = "a/b"', "without slashes"]),
+    "wall's name a number": (["wall.0.name=3"], ["wall[0].name = 3", "text in quotes", "``wall2``, ...)"]),
+    "digest": (
+        ["load.0={file = 'forces.csv', digest = 'abc'}"],
+        ['load[0].digest = "abc"', "expected 64 hexadecimal digits", "without this key any file is accepted"],
+    ),
     "wall of unknown nodes": (["wall.0.node_set=tp"], ['wall[0].node_set = "tp"', "did you mean 'tip'?"]),
     "load on unknown nodes": (["load.0.node_set=tp"], ['load[0].node_set = "tp"', "did you mean 'tip'?"]),
     "support of unknown nodes": (["support.0.node_set=bas"], ["support[0].node_set", "did you mean 'base'?"]),

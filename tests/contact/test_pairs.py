@@ -133,6 +133,7 @@ def test_unequal_bodies_keep_momentum(comm, shared_tmp_path):
     assert rows[-1]["pair/faces/force"][0] == 0.0 and max(row["pair/faces/force"][0] for row in rows) > 0.1
 
 
+@pytest.mark.parallel
 @pytest.mark.parametrize(
     "change, message",
     [
@@ -141,7 +142,11 @@ def test_unequal_bodies_keep_momentum(comm, shared_tmp_path):
         ({"gap": 0.2}, "beyond each other"),
         ({"second": "second"}, "first has 1 nodes and second 11"),
         ({"second": "rigt"}, "no node set of this name"),
-        ({"second": "left"}, "node 10 is paired with itself"),
+        ({"second": "left"}, "contact_pair 'faces': node 10 is paired with itself, .* give node sets without common"),
+        (
+            {"first": "second", "second": "second"},
+            "contact_pair 'faces': two nodes of second .* direction: 11 and 12 to 11; correct direction, or give",
+        ),
     ],
 )
 def test_refusals(change, message, comm, shared_tmp_path):

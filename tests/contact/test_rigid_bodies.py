@@ -314,10 +314,38 @@ def test_pictures_turn_with_bodies(comm, shared_tmp_path):
     np.testing.assert_allclose(turns[:, 0, 1, 0], np.sin(angles), atol=1e-12)
 
 
-def test_step_that_turns_too_far(comm, shared_tmp_path):
+@pytest.mark.parametrize("integrator", ["central_differences", "newmark"])
+def test_step_that_turns_too_far(integrator, comm, shared_tmp_path):
+    """The angle told is that of the angular velocity: 0.02 s times sqrt(14) 100 rad/s."""
     wall = {**SHAPES["sphere"], **BODY, "angular_velocity": [300.0, 100.0, 200.0]}
-    with pytest.raises(SimulationFailure, match=r"turns by more than .* reduce time.step"):
-        rows_of(bar(wall, FAR, step=0.02), comm, shared_tmp_path)
+    told = r"^step 1, t = 0.02 s: wall 'w' with inertia turns by about 7.48 rad in the step; .* reduce time.step"
+    with pytest.raises(SimulationFailure, match=told):
+        rows_of(bar(wall, FAR, integrator, step=0.02), comm, shared_tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("integrator", "told"),
+    [
+        ("central_differences", "step 6, t = 0.12 s: wall 'w' with inertia turns by about 5.3 rad in the step"),
+        ("newmark", "step 21, t = 0.42 s: wall 'w' with inertia turns by about 4.71 rad in the step"),
+    ],
+)
+def test_later_step_that_turns_too_far(integrator, told, comm, shared_tmp_path):
+    """A pendulum falls from its highest place; later steps of central differences are compiled."""
+    hinge = {"centre": [0.299, 0.0, -0.5], "axis": [0.0, 1.0, 0.0]}
+    wall = {**SHAPES["sphere"], "mass": 1.0, "inertia": [0.01] * 3, "gravity": True, "hinge": hinge}
+    case = bar(wall, FAR, integrator, step=0.02, end=1.0)
+    case["gravity"] = {"acceleration": [0.0, 0.0, -2500.0]}
+    with pytest.raises(SimulationFailure, match=f"^{told}"):
+        rows_of(case, comm, shared_tmp_path)
+
+
+def test_impact_that_turns_a_light_body_too_far(comm, shared_tmp_path):
+    wall = {**SHAPES["sphere"], "mass": 1e-4, "inertia": [1e-8] * 3, "centre_of_mass": [0.0, 0.0, -0.1]}
+    case = falling(wall, "newmark", velocity=(0.0, 0.0, -5.0), end=1e-2)
+    told = r"^step 1, t = 0.001 s: wall 'w' with inertia turns by about .* rad in the step; .* reduce time.step"
+    with pytest.raises(SimulationFailure, match=told):
+        rows_of(case, comm, shared_tmp_path)
 
 
 def test_rotation_vectors():

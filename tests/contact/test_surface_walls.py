@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 from helpers.lattices import lattice_case, planes, simulation
 from helpers.triangles import ball, box, groove
+from mpi4py import MPI
 
-from pfem_petsc import Case
+from pfem_petsc import Case, Simulation
 from pfem_petsc.contact.walls import surface
 from pfem_petsc.errors import InputError
 from pfem_petsc.post.motion import wall_surfaces
@@ -92,6 +93,9 @@ def test_a_surface_is_the_same_from_all_formats(tmp_path, name):
     np.testing.assert_allclose(wall_of(path, scale=0.5, point=[0.0, 0.0, 1.0], flip=True).gaps(x), -wall.gaps(x))
 
 
+FLOOR = {"name": "floor", "type": "plane", "point": [0.0, 0.0, -9.0], "normal": [0.0, 0.0, 1.0]}
+
+
 def cut(name, size):
     return FILES[name][:-size]
 
@@ -105,7 +109,14 @@ BAD = {
     "none.stl": (b"solid empty\nendsolid empty\n", "has no faces"),
     "nan.stl": (FILES["text.stl"].replace(b"vertex -1.0", b"vertex nan"), "coordinates that are not finite"),
     "points.obj": (b"v 0 0 0\nv 1 0 0\nv 0 1 0\n", "has no faces"),
-    "far.obj": (b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 9\n", "there is no point 8: the file has 3"),
+    "far.obj": (
+        b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\nf 1 2 9\n",
+        "line 5: there is no point 9: the file has 3, numbered from 1",
+    ),
+    "zero.obj": (
+        b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf 0 1 2\n",
+        "line 4: 'f 0 1 2': there is no point 0: points are numbered from 1",
+    ),
     "two.obj": (b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\nf 1 2\n", "face 1 .from 0. has 2 corners: expected 3 or more"),
     "text.obj": (b"v 0 0 zero\n", "line 1: 'v 0 0 zero': expected three numbers"),
     "early.ply": (cut("little.ply", 5), "ends early"),
@@ -132,15 +143,30 @@ def test_what_is_no_surface_is_refused(tmp_path, name):
         (tmp_path / name).write_bytes(content)
     with pytest.raises(InputError, match=message) as caught:
         wall_of(tmp_path / name)
-    assert str(caught.value).startswith("wall 'anvil': file: ")
-    assert name in str(caught.value)
+    assert str(caught.value).startswith(f'file = "{tmp_path / name}": ')
+    assert str(caught.value).count(str(tmp_path)) == 1 + (content is None)
+
+
+@pytest.mark.parametrize("staged", [False, True])
+def test_the_file_and_key_of_a_wall_are_named(staged, tmp_path):
+    (tmp_path / "far.obj").write_bytes(BAD["far.obj"][0])
+    case = lattice_case([FLOOR, {"name": "anvil", "type": "surface", "file": "far.obj"}])
+    table = "wall[1]"
+    if staged:
+        case["stage"] = [{"name": "one", "time": case.pop("time")}]
+        case["stage"][0]["wall"] = case.pop("wall")
+        table = "stage[0]: wall[1]"
+    told = f'a.toml: {table}.file = "{tmp_path / "far.obj"}": line 5: there is no point 9: '
+    with pytest.raises(InputError) as caught:
+        Simulation(Case.from_dict(case, folder=tmp_path, source="a.toml"), MPI.COMM_SELF, check_only=True)
+    assert str(caught.value).startswith(told)
 
 
 @pytest.mark.parametrize("scale", [1e-300, 1e300])
 def test_sizes_whose_squares_are_no_numbers_are_refused(tmp_path, scale):
     (tmp_path / "block.obj").write_bytes(FILES["quads.obj"])
     with pytest.raises(
-        InputError, match=r"block.obj: the surface is 4e.300 m large.*correct the wall's scale = 1e.300"
+        InputError, match=r"block.obj.: the surface is 4e.300 m large.*correct the wall's scale = 1e.300"
     ):
         wall_of(tmp_path / "block.obj", scale=scale)
 

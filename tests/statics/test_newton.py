@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from contextlib import nullcontext
+
 import numpy as np
 import pytest
 from helpers.small_models import case_of
@@ -124,11 +126,22 @@ def test_a_wall_presses_a_truss(shared_tmp_path, comm):
     assert abs(history["energy_imbalance"]).max() < 1e-9 * history["elastic_energy"].max()
 
 
+BOUNCY = {"name": "floor", "type": "plane", "point": [0.0, 0.0, -1.0], "normal": [0.0, 0.0, 1.0], "restitution": 0.5}
+PAIRED = {"feet": {"indices": [0, 2]}, "crown": {"indices": [1]}, "left": {"indices": [0]}, "right": {"indices": [2]}}
+PAIR = {"name": "feet", "first": "left", "second": "right", "direction": [1.0, 0.0, 0.0]}
+
+
 @pytest.mark.parametrize(
     ("tables", "words"),
     [
         ({"initial": {"velocity": [1.0, 0.0, 0.0]}}, ["initial", "no velocities"]),
         ({"contact": {"treatment": "stick"}}, ["contact.treatment", "impacts"]),
+        ({"wall": [BOUNCY]}, ["wall 'floor': restitution = 0.5", "a static analysis", "remove the key, or use [time]"]),
+        (
+            {"contact_pair": [{**PAIR, "restitution": 0.25}], "node_set": PAIRED},
+            ["contact_pair 'feet': restitution = 0.25", "remove the key"],
+        ),
+        ({"self_contact": {"restitution": 0.9}}, ["self_contact: restitution = 0.9", "remove the key"]),
         ({"support": []}, ["rigid-body motions", "[[support]]"]),
         ({"static": {"step": 0.1, "max_step": 0.01}}, ["max_step", "smaller than step"]),
         ({"static": {"method": "newtons"}}, ["static.method", "did you mean 'newton'"]),
@@ -143,6 +156,20 @@ def test_what_a_static_analysis_does_not_have_is_refused(shared_tmp_path, comm, 
         Simulation(truss(shared_tmp_path, comm, **tables), comm, output=shared_tmp_path / "out", quiet=True)
     for word in words:
         assert word in str(refused.value)
+
+
+@pytest.mark.parametrize("kinds", [("static", "time"), ("time", "static"), ("static", "static")])
+def test_static_stages_have_restitution_only_beside_one_with_time(shared_tmp_path, comm, kinds):
+    analyses = {"static": {}, "time": {"integrator": "newmark", "step": 1e-5, "end": 1e-4}}
+    data = truss(shared_tmp_path, comm).to_dict()
+    del data["static"]
+    data |= {"wall": [BOUNCY], "self_contact": {"restitution": 0.9}}
+    data["stage"] = [{"name": f"stage{k}", kind: analyses[kind]} for k, kind in enumerate(kinds)]
+    case, expected = Case.from_dict(data, folder=shared_tmp_path), nullcontext()
+    if "time" not in kinds:
+        expected = pytest.raises(InputError, match=r"wall 'floor': restitution = 0.5 .* a static analysis has none")
+    with expected:
+        Simulation(case, comm, output=shared_tmp_path / "out", quiet=True, check_only=True)
 
 
 def test_a_case_needs_an_analysis(shared_tmp_path, comm):

@@ -290,18 +290,22 @@ class RoundWall(BaseWall):
         return self.sign * (self._arms(x)[1] - self.radius)
 
 
-def made_wall(parameters: WallKeys, x: np.ndarray) -> BaseWall:
+def made_wall(parameters: WallKeys, x: np.ndarray, key: str) -> BaseWall:
     """Return the wall of its keys, after a look at what it gives for positions (m, 3) [m].
 
     Raises
     ------
     InputError
-        If a class that is not of the program does not do what :class:`BaseWall` says.
+        If a key is wrong, beginning with the file and the ``key`` of the wall's table, or a class that is not of the
+        program does not do what :class:`BaseWall` says.
     """
     module = lookup(WALLS, parameters.type, "wall.type")
     file = added_file(WALLS, parameters.type)
     if not file:
-        return module.Wall(parameters)
+        try:
+            return module.Wall(parameters)
+        except InputError as error:  # a wall knows its keys, but not the file that they are in
+            raise InputError(f"{key}.{error}") from error
     try:
         wall = module.Wall(parameters)
         flaw = _flaw(wall, x)

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Literal
 
 import numpy as np
-from pydantic import Field, ValidationInfo, model_validator
+from pydantic import ValidationInfo, model_validator
 
-from ...case.base import FileName, PositiveFloat, Vector3
+from ...case.base import Digest, FileName, PositiveFloat, Vector3
 from ...case.files import digest_of, found_file
+from ...case.toml import value_text
 from ...errors import InputError
 from ...formats import read_triangles
 from ...mechanics.compiled import by_reference
@@ -48,7 +49,7 @@ class Parameters(WallKeys):
     """true: the front is where the file has the back"""
     thickness: PositiveFloat | None = None
     """of a surface that stops nodes from both sides [m], half of it on each; default: 1e-6 of its size"""
-    digest: Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")] | None = None
+    digest: Digest | None = None
     """SHA-256 of the content of the file, which results and checkpoints keep; default: that of the file"""
 
     @model_validator(mode="after")
@@ -78,19 +79,21 @@ class Wall(BaseWall):
     faces = 3
 
     def __init__(self, parameters: Parameters) -> None:
-        where = f"wall {parameters.name!r}: file: "
-        path = Path(parameters.file)
-        points, corners = read_triangles(path, where)
+        path, where = Path(parameters.file), f"file = {value_text(parameters.file)}: "
+        try:
+            points, corners = read_triangles(path)
+        except InputError as error:
+            raise InputError(f"{where}{error}") from error
         if parameters.digest and parameters.digest != digest_of(path):
             raise InputError(
-                f"{where}{path}: is not the file that the case was made with (digest {parameters.digest[:12]}...): "
+                f"{where}is not the file that the case was made with (digest {parameters.digest[:12]}...): "
                 "restore it, or start a new run without the key digest"
             )
-        self.points, self.corners, self._edges = checked(points, corners, f"{where}{path}")
+        self.points, self.corners, self._edges = checked(points, corners, where)
         size = parameters.scale * float(np.ptp(self.points, axis=0).max())
         if not _SIZES[0] <= size <= _SIZES[1]:
             raise InputError(
-                f"{where}{path}: the surface is {size:.3g} m large, whose square double precision cannot hold; correct "
+                f"{where}the surface is {size:.3g} m large, whose square double precision cannot hold; correct "
                 f"the wall's scale = {parameters.scale!r}, metres per unit of length of the file"
             )
         self.points = parameters.scale * self.points + np.array(parameters.point)
@@ -150,7 +153,7 @@ def checked(
     """
     size = float(np.ptp(points[corners].reshape(-1, 3), axis=0).max())
     if not 0.0 < size < np.inf:
-        raise InputError(f"{where}: all points of the surface are at one place, or too far away")
+        raise InputError(f"{where}all points of the surface are at one place, or too far away")
     kept, corners = np.unique(coincident(points, SAME * size)[corners], return_inverse=True)
     points, corners = points[kept], corners.reshape(-1, 3)
     corners = corners[(corners != np.roll(corners, 1, axis=1)).all(axis=1)]
@@ -158,7 +161,7 @@ def checked(
     def refused(what: str, wrong: np.ndarray, ends: np.ndarray, way_out: str) -> None:
         if len(wrong):
             at = " to ".join(f"({', '.join(f'{x:.6g}' for x in points[end])})" for end in ends[wrong[0]])
-            raise InputError(f"{where}: {what}, at {at} in the file ({len(wrong)} such places): {way_out}")
+            raise InputError(f"{where}{what}, at {at} in the file ({len(wrong)} such places): {way_out}")
 
     sides = np.roll(points[corners], -1, axis=1) - points[corners]
     heights = np.linalg.norm(np.cross(sides[:, 0], sides[:, 1]), axis=1) / np.linalg.norm(sides, axis=2).max(axis=1)
@@ -178,7 +181,7 @@ def checked(
     uniform = "orient them the same way (in PyVista: mesh.compute_normals(consistent_normals=True))"
     refused("two triangles have opposite sides in front at their edge", turned, ends, uniform)
     if not len(corners):
-        raise InputError(f"{where}: has no triangles that are not points or lines")
+        raise InputError(f"{where}has no triangles that are not points or lines")
     return points, corners, (ends, count, number.reshape(-1, 3))
 
 

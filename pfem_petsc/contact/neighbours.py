@@ -9,7 +9,6 @@ rank that has most segments there. Points are segments whose ends coincide.
 
 from __future__ import annotations
 
-from itertools import product
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -20,7 +19,7 @@ from ..mechanics.compiled import inlined, kernel
 from ..mesh.exchange import Router
 from ..mesh.slab import slab_of
 from ..parallel.heap import returning_freed_memory
-from .rotations import along, cross, dot, minus, put, vector
+from .rotations import along, cross, dot, minus, vector
 
 # Limits for each segment: pieces, and comparisons.
 _PIECES, _COMPARISONS = 8.0, 2000.0
@@ -156,17 +155,8 @@ def largest_change(comm: MPI.Comm, motion: tuple[np.ndarray, np.ndarray], n_node
 def _measure(
     comm: MPI.Comm, at: np.ndarray, own: Segments, longest: float, skin: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the largest coordinates, with the negative sign and without, and how far pieces with their margins reach
-    from their middles along x, y and z (9,); and the numbers of segments longer than zero, the sum of their lengths
-    with margins, and the number of pieces (3,), of all ranks. Collective."""
-    ends, margin = at[own.points], own.margin + 0.5 * skin
-    way = ends[:, 1] - ends[:, 0]
-    length = np.sqrt(np.einsum("ni,ni->n", way, way))
-    # never more than those of loops, which round otherwise: then cells would be too small
-    pieces = np.floor((1.0 - 1e-9) * length / np.maximum(longest, 4.0 * margin)) + 1.0
-    reach = 0.5 * np.abs(way) / pieces[:, None] + margin[:, None]
-    most = np.stack([-ends.min(axis=1), ends.max(axis=1), reach]).max(axis=1, initial=-np.inf).ravel()
-    sums = np.array([np.count_nonzero(length), (length + 2.0 * own.margin).sum(), pieces.sum()])
+    """Return extremes (9,) and sums (3,) of all segments, see :func:`_measure_segments`. Collective."""
+    most, sums = _measure_segments(at, own, longest, skin)
     comm.Allreduce(MPI.IN_PLACE, most, op=MPI.MAX)
     comm.Allreduce(MPI.IN_PLACE, sums, op=MPI.SUM)
     return most, sums
@@ -175,14 +165,12 @@ def _measure(
 def _hold(comm: MPI.Comm, grid: _Grid, points: Points, own: Segments) -> tuple[Points, Segments]:
     """Give blocks to ranks, and send segments to those of their cells and of the neighbouring ones; return those that
     this rank has then. Collective."""
-    rows, _, cells = _list_pieces(points.at, own, grid)
-    votes = np.bincount(_block(cells), minlength=_BLOCKS) * comm.size
-    votes += (np.arange(_BLOCKS) + comm.rank) % comm.size  # of equal ones, by turns
+    votes = np.zeros(_BLOCKS, np.int64)
+    _count_blocks(points.at, own, grid, votes)
+    votes = votes * comm.size + (np.arange(_BLOCKS) + comm.rank) % comm.size  # of equal ones, by turns
     comm.Allreduce(MPI.IN_PLACE, votes, op=MPI.MAX)
     grid.owners[:] = (votes - np.arange(_BLOCKS)) % comm.size
-    ranks = [grid.owners[_block(np.maximum(cells + shift, 0))] for shift in product((-1, 1), repeat=3)]
-    rank, row = np.divmod(np.unique(np.stack(ranks) * len(own.ids) + rows), max(len(own.ids), 1))
-    router = Router(comm, rank, row)
+    router = Router(comm, *_list_ranks(points.at, own, grid, comm.size))
     ends = router.send(points.at[own.points])
     before = router.send(points.before[own.points]) if len(points.before) else points.before
     names = router.send(points.names[own.points])
@@ -218,14 +206,7 @@ def _compare(grid: _Grid, points: Points, held: Segments, most: float) -> tuple[
     marks = points.names
     if int(marks.max(initial=0)) > np.iinfo(np.int32).max:
         marks = np.unique(marks, return_inverse=True)[1]
-    rows, parts, cells = _list_pieces(points.at, held, grid)
-    x, y, z = (cells % folded).T
-    places = (x * folded[1] + y) * folded[2] + z
-    order = np.argsort(places, kind="stable")
-    starts = np.append(0, np.cumsum(np.bincount(places, minlength=folded.prod())))
-    rows, parts, here = rows[order], parts[order], (grid.owners[_block(cells)] == grid.rank)[order]
-    boxes = _box_pieces(points.at, held, grid, rows, parts, marks.astype(np.int32))
-    pieces = _Pieces(starts.astype(np.int32), rows, parts, *boxes, here)
+    pieces = _sort_pieces(points.at, held, grid, folded, marks.astype(np.int32))
     rows, at, gap, comparisons = _compare_rows(pieces, points, held, grid, folded, most)
     ids = held.ids[rows].astype(np.int64)
     return Pairs(ids, points.names[held.points[rows]].astype(np.int64), at, gap), comparisons
@@ -241,6 +222,28 @@ def _pieces(at, segments, n, longest, skin):
     return first, way, margin, 1 if square <= most * most else int(np.sqrt(square) / most) + 1
 
 
+@kernel
+def _measure_segments(at, segments, longest, skin):
+    """Return the largest coordinates, with the negative sign and without, and how far pieces with their margins reach
+    from their middles along x, y and z (9,); and the numbers of segments longer than zero, the sum of their lengths
+    with margins, and the number of pieces (3,)."""
+    most, sums = np.full(9, -np.inf), np.zeros(3)
+    number = total = every = 0.0
+    for n in range(len(segments.ids)):
+        first, way, margin, pieces = _pieces(at, segments, n, longest, skin)
+        part, square = 0.5 / pieces, dot(way, way)
+        for c in range(3):
+            last = first[c] + way[c]
+            most[c] = max(most[c], -first[c], -last)
+            most[3 + c] = max(most[3 + c], first[c], last)
+            most[6 + c] = max(most[6 + c], part * abs(way[c]) + margin)
+        number += square > 0.0
+        total += np.sqrt(square) + 2.0 * segments.margin[n]
+        every += pieces
+    sums[0], sums[1], sums[2] = number, total, every
+    return most, sums
+
+
 @inlined
 def _cell(first, way, part, pieces, grid):
     """Return the numbers of the cell of the middle of a piece along the axes. They grow with the coordinates, by no
@@ -251,28 +254,42 @@ def _cell(first, way, part, pieces, grid):
     return i, j, int(min(max(z * grid.inverse[2], 0.0), grid.count[2] - 1.0))
 
 
+@inlined
+def _block(i, j, k):
+    """Return the number of a block of cells."""
+    key = np.uint64(((i << 42) | (j << 21) | k) + 1)
+    return np.int64((key * np.uint64(0x9E3779B97F4A7C15)) >> np.uint64(33)) % _BLOCKS
+
+
 @kernel
-def _list_pieces(at, segments, grid):
-    """Return the rows of the segments of all pieces (m,) int32, their numbers among those of the segment (m,) int32,
-    and the cells (m, 3) of their middles."""
-    count = 0
-    for n in range(len(segments.ids)):
-        count += _pieces(at, segments, n, grid.longest, grid.skin)[3]
-    rows, parts, cells, m = np.empty(count, np.int32), np.empty(count, np.int32), np.empty((count, 3), np.int64), 0
+def _count_blocks(at, segments, grid, votes):
+    """Count the pieces in each block."""
     for n in range(len(segments.ids)):
         first, way, _, pieces = _pieces(at, segments, n, grid.longest, grid.skin)
         for part in range(pieces):
-            rows[m], parts[m] = n, part
-            put(cells, m, _cell(first, way, part, pieces, grid))
-            m += 1
-    return rows, parts, cells
+            i, j, k = _cell(first, way, part, pieces, grid)
+            votes[_block(i // _BLOCK, j // _BLOCK, k // _BLOCK)] += 1
 
 
-def _block(cells: np.ndarray) -> np.ndarray:
-    """Return the numbers of the blocks of cells (..., 3)."""
-    i, j, k = np.moveaxis(cells // _BLOCK, -1, 0).astype(np.uint64)
-    key = ((i << np.uint64(42)) | (j << np.uint64(21)) | k) + np.uint64(1)
-    return ((key * np.uint64(0x9E3779B97F4A7C15)) >> np.uint64(33)).astype(np.int64) % _BLOCKS
+@kernel
+def _list_ranks(at, segments, grid, size):
+    """Return the ranks to which each segment goes, and its row, for each."""
+    seen, count = np.full(size, -1, np.int64), 0
+    ranks, rows = np.empty(_ROOM, np.int64), np.empty(_ROOM, np.int64)
+    for n in range(len(segments.ids)):
+        first, way, _, pieces = _pieces(at, segments, n, grid.longest, grid.skin)
+        if count + size > len(rows):
+            ranks, rows = _longer(ranks, size), _longer(rows, size)
+        for part in range(pieces):
+            x, y, z = _cell(first, way, part, pieces, grid)
+            for i in range(max(x - 1, 0) // _BLOCK, (x + 1) // _BLOCK + 1):
+                for j in range(max(y - 1, 0) // _BLOCK, (y + 1) // _BLOCK + 1):
+                    for k in range(max(z - 1, 0) // _BLOCK, (z + 1) // _BLOCK + 1):
+                        owner = grid.owners[_block(i, j, k)]
+                        if seen[owner] < n:
+                            seen[owner], ranks[count], rows[count] = n, owner, n
+                            count += 1
+    return ranks[:count], rows[:count]
 
 
 @inlined
@@ -283,23 +300,49 @@ def _longer(array, more):
     return copy
 
 
+@inlined
+def _fold(i, count):
+    """Return the place of a cell along an axis with some places; divisions are slow."""
+    return i if i < count else i % count
+
+
 @kernel
-def _box_pieces(at, segments, grid, rows, parts, marks):
-    """Return the boxes (m, 6), ways (m, 4) and ends (m, 2) of :class:`_Pieces`; ``marks`` (p,) int32 of points, equal
-    where their names are."""
-    most, unit = len(rows), grid.unit
+def _sort_pieces(at, segments, grid, folded, marks):
+    """Return the pieces of segments, sorted by cells; ``folded`` (3,): places of cells along the axes; ``marks`` (p,)
+    int32 of points, equal where their names are."""
+    starts, most = np.zeros(folded[0] * folded[1] * folded[2] + 2, np.int32), 0
+    for n in range(len(segments.ids)):
+        most += _pieces(at, segments, n, grid.longest, grid.skin)[3]
+    cells, here, unit, m = np.empty(most, np.int32), np.empty(most, np.bool_), grid.unit, 0
+    for n in range(len(segments.ids)):
+        first, way, _, pieces = _pieces(at, segments, n, grid.longest, grid.skin)
+        for part in range(pieces):
+            i, j, k = _cell(first, way, part, pieces, grid)
+            cells[m] = (_fold(i, folded[0]) * folded[1] + _fold(j, folded[1])) * folded[2] + _fold(k, folded[2])
+            starts[cells[m] + 2] += 1
+            m += 1
+    for cell in range(len(starts) - 1):
+        starts[cell + 1] += starts[cell]
+    rows, parts, m = np.empty(most, np.int32), np.empty(most, np.int32), 0
     boxes, ways, ends = np.empty((most, 6), np.float32), np.empty((most, 4), np.float32), np.empty((most, 2), np.int32)
-    for m in range(most):
-        first, way, margin, pieces = _pieces(at, segments, rows[m], grid.longest, grid.skin)
-        ends[m, 0], ends[m, 1] = marks[segments.points[rows[m], 0]], marks[segments.points[rows[m], 1]]
-        middle, slack = minus(along(first, (parts[m] + 0.5) / pieces, way), grid.low), 0.0
-        for c in range(3):  # in single precision, boxes are rounded outwards
-            slack = max(slack, 2e-7 * ((abs(middle[c]) + abs(way[c])) / unit + 1.0))
-        ways[m, 3] = margin / unit + slack
-        for c in range(3):
-            boxes[m, c], ways[m, c] = middle[c] / unit, way[c] / pieces / unit
-            boxes[m, 3 + c] = _HALF * abs(ways[m, c]) + ways[m, 3]
-    return boxes, ways, ends
+    for n in range(len(segments.ids)):
+        first, way, margin, pieces = _pieces(at, segments, n, grid.longest, grid.skin)
+        for part in range(pieces):
+            place = starts[cells[m] + 1]
+            starts[cells[m] + 1] += 1
+            m += 1
+            i, j, k = _cell(first, way, part, pieces, grid)
+            here[place] = grid.owners[_block(i // _BLOCK, j // _BLOCK, k // _BLOCK)] == grid.rank
+            rows[place], parts[place] = n, part
+            ends[place, 0], ends[place, 1] = marks[segments.points[n, 0]], marks[segments.points[n, 1]]
+            middle, slack = minus(along(first, (part + 0.5) / pieces, way), grid.low), 0.0
+            for c in range(3):  # in single precision, boxes are rounded outwards
+                slack = max(slack, 2e-7 * ((abs(middle[c]) + abs(way[c])) / unit + 1.0))
+            ways[place, 3] = margin / unit + slack
+            for c in range(3):
+                boxes[place, c], ways[place, c] = middle[c] / unit, way[c] / pieces / unit
+                boxes[place, 3 + c] = _HALF * abs(ways[place, c]) + ways[place, 3]
+    return _Pieces(starts[:-1], rows, parts, boxes, ways, ends, here)
 
 
 @inlined

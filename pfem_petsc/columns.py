@@ -126,6 +126,7 @@ COUNTS = (
             kind=kind,
             value=lambda now, name=name: now.model.self_contact.of_row(name),
             exists=lambda model: model.self_contact is not None,
+            looped=True,
         )
         for name, unit, kind in (("contacts", "", np.int64), ("overlap", "m", float), ("force", "N", float))
     ),

@@ -519,6 +519,28 @@ def largest_move(rows, last, drift, most):
 
 
 @kernel
+def largest_speed(half, drift, most):
+    """Return a bound of the velocities (3, n) of nodes relative to ``drift`` (3,), see :func:`largest_move`."""
+    square = 0.0
+    for c in range(3):
+        speeds, shift, limit = half[c], drift[c], most[c]
+        beyond = 0
+        for i in range(len(speeds)):
+            beyond += 0 if abs(speeds[i] - shift) <= limit else 1
+        if beyond > 0:
+            largest, total = 0.0, 0.0
+            for i in range(len(speeds)):
+                d = speeds[i] - shift
+                total = add_freely(total, d)
+                largest = max(largest, abs(d))
+            if not np.isfinite(total):
+                return np.inf
+            most[c] = _WIDER * largest
+        square += most[c] * most[c]
+    return np.sqrt(square)
+
+
+@kernel
 def read_nodes(rows, x, last):
     """Return positions x (n or more, 3) and displacements since last (3, n) of some nodes (k,), see
     :class:`NodeArrays`."""
@@ -871,6 +893,24 @@ class SelfContact:
             self.dissipated += self.at_walls.evaluate(x, step) if commit else 0.0
             stored += self.at_walls.energy
         return stored, self.dissipated
+
+    def way_left(self) -> float:
+        """Return how far bars may come closer until :meth:`evaluate` is needed again [m]: zero unless this is known on
+        one rank."""
+        if self.comm.size > 1 or self.at_walls is not None or self.stale or self._model.supports.moves:
+            return 0.0
+        return max(min(self._limit, self._asleep) - self._way, 0.0)
+
+    @property
+    def drift(self) -> np.ndarray:
+        """The velocity (3,) relative to which moves are measured [m/s]."""
+        return self._drift
+
+    def pass_over(self, way: float, x: np.ndarray) -> None:
+        """Take account of committed steps without contact, in which bars have come closer by at most a ``way`` [m], to
+        positions (local, 3)."""
+        self._way += way
+        self._last[:] = x[: self._last.shape[1]].T
 
     def _look(self, x: np.ndarray, step: float, commit: bool) -> Look | None:
         """Return the nodes of pairs at positions (local, 3), states of the pairs, with those that begin to touch, and

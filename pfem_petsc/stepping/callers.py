@@ -11,11 +11,12 @@ from numba import types
 
 from ..contact.explicit import OutOfReachError
 from ..contact.free_walls import TurnsTooFarError
+from ..contact.self_contact import CONTACTS, FORCE, OVERLAP
 from ..errors import SimulationFailure
 from ..mesh.exchange import CFunction
 from ..parallel.agreement import is_alone
 from .called_walls import AGAIN, FOUND, MOVED, PRESSED, SUSPECTS, CalledWalls, new_called_walls
-from .compiled_loop import CHANGING, CLOSED, HELD, SOLVE, CalledRows
+from .compiled_loop import CHANGING, CLOSED, DRIFT, HELD, MOST, SOLVE, WAY, WAY_LEFT, CalledRows
 from .phases import FAILED, LOST
 
 if TYPE_CHECKING:
@@ -154,24 +155,50 @@ class RowCaller(Caller):
 
 
 class TouchCaller(Caller):
-    """Adds the forces of bars that touch in compiled steps.
+    """Adds the forces of bars that touch in compiled steps; ``half`` (3, owned): velocities of the loop at half steps.
 
     Attributes
     ----------
-    energies : (2,) stored and dissipated in the last call [J]
+    sums : (5,) energies stored and dissipated in the last call [J], and the columns of a row on one rank
+    asleep : (8,) see :class:`~pfem_petsc.stepping.compiled_loop.StepArrays`
     """
 
-    def __init__(self, stepper: Stepper) -> None:
+    def __init__(self, stepper: Stepper, half: np.ndarray) -> None:
         super().__init__(stepper)
-        self.energies, n = np.zeros(2), len(stepper.state.x)
+        self.sums, self.asleep, self._half, n = np.zeros(5), np.zeros(8), half, len(stepper.state.x)
         self._x, self._f = (room.T[:n] for room in stepper.model.bars.components)
+        self._touch = stepper.model.self_contact
+
+    def begin(self, step: int) -> None:
+        super().begin(step)
+        self._sleep()
+
+    def end(self) -> None:
+        self._pass_over(self._x)
+        super().end()
+
+    def _sleep(self) -> None:
+        """Find how far the loop may go alone."""
+        if self._touch is not None:
+            self.asleep[WAY_LEFT], self.asleep[WAY] = self._touch.way_left(), 0.0
+            self.asleep[DRIFT:MOST], self.asleep[MOST:] = self._touch.drift, 0.0
+
+    def _pass_over(self, x: np.ndarray) -> None:
+        """Tell of the steps that the loop has made alone, up to positions (local, 3)."""
+        if self.asleep[WAY] > 0.0:
+            self._touch.pass_over(float(self.asleep[WAY]), x)
+            self.asleep[WAY] = 0.0
 
     def _make(self, step: int, what: int) -> None:
         stepper = self.stepper
+        if self.asleep[WAY] > 0.0:  # up to the start of this step
+            self._pass_over(self._x[: self._half.shape[1]] - stepper.h * self._half.T)
         try:
-            self.energies[:] = stepper.model.self_contact.evaluate(self._x, self._f, stepper.h, commit=True)
+            self.sums[:2] = self._touch.evaluate(self._x, self._f, stepper.h, commit=True)
         except SimulationFailure as failure:
             raise SimulationFailure(f"{stepper.at(step, step * stepper.h)}: {failure}") from failure
+        self.sums[2:] = self._touch.sums[[CONTACTS, OVERLAP, FORCE]]
+        self._sleep()
 
 
 class WallCaller(Caller):

@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..columns import BAR_ENERGIES, HEAD, PROBED
+from ..contact.self_contact import largest_speed
 from ..mechanics.compiled import addressed, inlined, kernel, record
 from ..mechanics.elements import first_inverted
 from ..mechanics.internal_forces import BarArrays, internal_forces
@@ -49,6 +50,7 @@ SOLVE, CLOSE = range(2)
 """What a call of Python does: solve rows, or find the energy that they lose."""
 
 HELD, CHANGING, CLOSED = range(3)  # places of numbers in CalledRows
+WAY_LEFT, WAY, DRIFT, MOST = 0, 1, 2, 5  # places in StepArrays.asleep
 
 record(Messages)  # which stands below the compiled loops
 
@@ -187,8 +189,10 @@ class StepArrays(NamedTuple):
     """All that compiled steps read and write, of which the latter parts are: the sums of the ledger, of which the
     dissipations by impact and friction and the work of walls are added to; works (5,) of all balances; energies of
     bars; particles of impulses, and their increments (rows, 3) in a step; the nodes of probes; forces of walls (w, 3)
-    at the start [N]; energy of bars that touch, and what they have lost (2,) [J]; and this rank's shares (m, width) of
-    the rows of the steps that are due, and at last of the last step if it is not, see
+    at the start [N]; energy of bars that touch, what they have lost [J], and their columns of a row (5,); of bars that
+    are too far from each other to touch, by how much they may come closer until Python looks again, by how much they
+    have at most [m], and the drift and bounds of :func:`~pfem_petsc.contact.self_contact.largest_speed` (8,); and this
+    rank's shares (m, width) of the rows of the steps that are due, and at last of the last step if it is not, see
     :class:`~pfem_petsc.columns.Share`."""
 
     contacts: Contacts
@@ -217,6 +221,7 @@ class StepArrays(NamedTuple):
     probes: np.ndarray
     push: np.ndarray
     touching: np.ndarray
+    asleep: np.ndarray
     shares: np.ndarray
 
 
@@ -241,6 +246,7 @@ _MOMENTA, _SUPPORT, _ACTIVE = map(
 )
 _BARS, _PROBED = HEAD.indices(BAR_ENERGIES), len(PROBED)
 _ENERGIES, _SPRINGS = len(BAR_ENERGIES), BAR_ENERGIES.index("spring_energy")
+_PAIRS = HEAD.first("self_contact/contacts")  # followed by overlap and force
 _TOUCHING, _TOUCHED = map(BAR_ENERGIES.index, ("self_contact_energy", "self_contact_dissipation"))
 
 
@@ -311,7 +317,13 @@ def evaluate_forces(s, step):
 
 @addressed
 def touch_bars(s, step):
-    """Have Python add the forces of bars that touch."""
+    """Have Python add the forces of bars that touch, unless none can have come near enough."""
+    asleep, motion = s.asleep, s.motion
+    if asleep[WAY_LEFT] > 0.0:
+        way = 2.0 * motion.h * largest_speed(motion.half, asleep[DRIFT : DRIFT + 3], asleep[MOST : MOST + 3])
+        if asleep[WAY] + way < asleep[WAY_LEFT]:
+            asleep[WAY] += way
+            return
     if s.calls.touch(step, np.int64(0)) != 0:
         s.course.unsolved = LOST
 
@@ -442,6 +454,7 @@ def record_row(s, step):
     ends = sums.ends
     energies[_SPRINGS] = sums.springs[3]
     energies[_TOUCHING], energies[_TOUCHED] = s.touching[0], s.touching[1]
+    row[_PAIRS], row[_PAIRS + 1], row[_PAIRS + 2] = s.touching[2], s.touching[3], s.touching[4]
     for k in range(len(ledger)):
         row[k] = ledger[k]
     stored = 0.0

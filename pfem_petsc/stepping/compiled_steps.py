@@ -129,7 +129,7 @@ class CompiledSteps:
         self._pressed, self._outcome = new_contact_nodes(*rooms), np.zeros(10, dtype=np.int64)
         self._called = RowCaller(stepper, self._nodes.stiffness, self._u, self._contact)
         self._toucher, self._wall_caller = (
-            TouchCaller(stepper),
+            TouchCaller(stepper, self._motion.half),
             WallCaller(stepper, self._nodes, self._pressed, self._contact),
         )
         calls = *_mpi(), self._called.function, self._toucher.function, self._wall_caller.function
@@ -143,6 +143,7 @@ class CompiledSteps:
         self._bar_probes = slice(at - bars, at)
         self._ends_at_rows = bars > 0 or not all(column.looped for column in self._at_state)
         self._ends_at_rows |= model.contact.motion.bodies.any  # rows have where they are
+        self._ends_at_rows |= model.self_contact is not None and model.comm.size > 1  # and what is largest on all ranks
         return_freed_memory()
 
     def _make_nodes(self) -> Nodes:
@@ -331,7 +332,8 @@ class CompiledSteps:
             self._particles,
             stepper.probed,
             stepper.solution.walls.force.copy(),
-            self._toucher.energies,
+            self._toucher.sums,
+            self._toucher.asleep,
             shares,
         )
         reference = self._references.of(arrays)

@@ -496,8 +496,8 @@ def check_case(text: str, comm: MPI.Comm, folder: Path, source: str, restart: bo
 
 
 def _apart(found: dict[str, float], size: int) -> dict[str, float]:
-    """Return differences that are faults: on one rank all. PT-Scotch goes on with its random numbers, so that the second
-    run of a process may have other nodes on a rank, and sums over ranks other parts."""
+    """Return differences that are faults: on one rank all. On several, PT-Scotch goes on with its random numbers, so
+    that the second run of a process may have other nodes on a rank, and sums over ranks other parts."""
     if size == 1:
         return found
     rounding = "checks/", "history/energy_imbalance", "history/linear_iterations", "history/newton_iterations"

@@ -141,6 +141,8 @@ def spline_slopes(times: np.ndarray, values: np.ndarray) -> np.ndarray:
     """Return the slopes (n,) of the cubic spline through values (n,), zero at both ends and at intervals of rest."""
     from scipy.linalg import solve_banded  # takes longer than most cases need
 
+    if len(times) < 3:
+        return np.zeros(len(times))
     width = np.diff(times)
     rate = np.diff(values) / width
     still = np.zeros(len(times), dtype=bool)

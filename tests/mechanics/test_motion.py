@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from pfem_petsc.mechanics.motion import motion_of
+from pfem_petsc.mechanics.motion import motion_of, spline_slopes
 
 
 def motion(rows=None, interpolation="smooth", velocity=None, acceleration=None):
@@ -102,3 +102,8 @@ def test_linear_tables_and_constant_velocities():
     assert steps == pytest.approx([-8.0 if k == 10 else 3.0 if k == 20 else 0.0 for k in range(25)], abs=1e-12)
     moved = motion(velocity=(2.0, 0.0, 0.0)).at(3.0)
     assert (moved == [[6.0, 0.0, 0.0], [2.0, 0.0, 0.0], [0.0, 0.0, 0.0]]).all()
+
+
+@pytest.mark.filterwarnings("error")
+def test_a_row_alone_stands_still():
+    np.testing.assert_array_equal(spline_slopes(np.array([0.5]), np.array([2.0])), [0.0])

@@ -178,8 +178,9 @@ class TouchCaller(Caller):
         super().end()
 
     def _sleep(self) -> None:
-        """Find how far the loop may go alone."""
+        """Find how far the loop may go alone, and what rows have until the next call."""
         if self._touch is not None:
+            self.sums[1], self.sums[2:] = self._touch.dissipated, self._touch.sums[[CONTACTS, OVERLAP, FORCE]]
             self.asleep[WAY_LEFT], self.asleep[WAY] = self._touch.way_left(), 0.0
             self.asleep[DRIFT:MOST], self.asleep[MOST:] = self._touch.drift, 0.0
 
@@ -197,7 +198,6 @@ class TouchCaller(Caller):
             self.sums[:2] = self._touch.evaluate(self._x, self._f, stepper.h, commit=True)
         except SimulationFailure as failure:
             raise SimulationFailure(f"{stepper.at(step, step * stepper.h)}: {failure}") from failure
-        self.sums[2:] = self._touch.sums[[CONTACTS, OVERLAP, FORCE]]
         self._sleep()
 
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from mpi4py import MPI
 
-from pfem_petsc import Case, Simulation, Truss
+from pfem_petsc import Case, Simulation, Truss, open_result
 from pfem_petsc.contact.bars_at_walls import damping_of, restitution_of
 from pfem_petsc.contact.neighbours import segment_distance
 from pfem_petsc.contact.self_contact import (
@@ -470,3 +470,28 @@ def test_a_radius_in_another_unit_is_told(comm, tmp_path):
     }
     run = Simulation(Case.from_dict(case), comm, output=tmp_path, quiet=True)
     assert any("bars are up to 10 m thick and 2 m long on average" in text for text in run.model.warnings)
+
+
+def test_what_is_dissipated_stays_so_when_supports_are_removed(comm, tmp_path):
+    """Loops that begin anew while no bars are near have not called for forces yet."""
+    case = {
+        "mesh": {
+            "generator": "arrays",
+            "points": [[-1, 0, 0], [1, 0, 0], [0, -1, 0.03], [0, 1, 0.03], [0, 0, 9], [1, 0, 9]],
+            "bars": [[0, 1], [2, 3], [4, 5]],
+        },
+        "node_set": {"b": {"indices": [2, 3]}, "c": {"indices": [4, 5]}},
+        "material": {"m": {"young_modulus": 1e7, "density": 1000.0}},
+        "section": {"s": {"area": 1e-4, "material": "m"}},
+        "initial": {"on": [{"node_set": "b", "velocity": [0.0, 0.0, -0.4]}]},
+        "support": [{"name": "held", "node_set": "c", "fix": "xyz"}],
+        "self_contact": {"radius": 0.01, "restitution": 0.6},
+        "remove": [{"supports": "held", "time": 0.16}],
+        "time": {"integrator": "central_differences", "step": 2e-4, "end": 0.18},
+        "output": {"history_every": 7, "fields_every": 0},
+    }
+    run = Simulation(Case.from_dict(case), comm, output=tmp_path, quiet=True)
+    run.run()
+    if comm.rank == 0:
+        lost = open_result(tmp_path).history["self_contact_dissipation"]
+        assert lost[-1] > 0.0 and np.diff(lost).min() >= 0.0

@@ -26,8 +26,8 @@ EVENTS: dict[str, tuple[str, ...]] = {
     "pfemContact": ("model.contact.explicit", "model.contact.near", "model.contact.frames"),
     "pfemLedger": ("stepper.ledger.update",),
     "pfemHistory": ("outputs.history.record",),
-    "pfemSnapshot": ("outputs.snapshots.write",),
-    "pfemCheckpoint": ("outputs.checkpointing.write",),
+    "pfemSnapshot": ("outputs.snapshots.observe",),
+    "pfemCheckpoint": ("outputs.checkpointing.observe",),
 }
 """Event to the methods of a simulation that it measures. Nested events are counted in both."""
 

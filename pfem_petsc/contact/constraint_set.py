@@ -448,13 +448,8 @@ class ConstraintSet:
                 values = rows.values(x)
             except SimulationFailure as failure:
                 raise InputError(f"{self.source}: {failure}") from failure
-        deepest = (np.inf,)
-        if len(values) and not values.min() >= -ON_BOUND * length:
-            row = int(np.argmin(values))
-            numbers = [str(n) for n in rows.numbers[rows.ends[row][rows.ends[row] >= 0]]]
-            deepest = (float(values[row]), int(rows.source[row]), int(rows.ids[row]), numbers)
-        deepest = min(comm.allgather(deepest))
-        if len(deepest) > 1:
+        deepest = self._deepest(values, ON_BOUND * length)
+        if deepest is not None:
             depth, table, _, numbers = deepest
             if table < self.n_pairs:
                 raise InputError(
@@ -481,19 +476,29 @@ class ConstraintSet:
         if not self:
             return
         rows, x = self.rows, self.rows.gather(x)
-        values = np.where(rows.usable(rows.gradients(x)), np.inf, rows.values(x))
-        deepest: tuple[Any, ...] = (-BEYOND * self.contact.size,)
-        if len(values) and values.min() < deepest[0]:
-            row = int(np.argmin(values))
-            numbers = [str(n) for n in rows.numbers[rows.ends[row][rows.ends[row] >= 0]]]
-            deepest = float(values[row]), self.columns[rows.source[row]].replace("/", " "), ", ".join(numbers)
-        deepest = min(self.mesh.comm.allgather(deepest))
-        if len(deepest) > 1:
-            depth, name, nodes = deepest
+        values, tolerance = rows.values(x), BEYOND * self.contact.size
+        beyond = values < -tolerance
+        if beyond.any():
+            beyond &= ~rows.usable(rows.gradients(x))
+        deepest = self._deepest(np.where(beyond, values, np.inf), tolerance)
+        if deepest is not None:
+            depth, table, _, numbers = deepest
+            name, nodes = self.columns[table].replace("/", " "), ", ".join(numbers)
             raise SimulationFailure(
                 f"{where}: nodes {nodes} of {name!r} are {-depth:.3g} m beyond each other, moved there by their "
                 "supports; free one of them, change the motion of the supports, or remove these nodes from the table"
             )
+
+    def _deepest(self, values: np.ndarray, tolerance: float) -> tuple[float, int, int, list[str]] | None:
+        """Return the value [m], table, number and nodes of the row that is lowest of all ranks, of ``values`` (r,), or
+        None if none is below zero by more than a tolerance [m]. Collective."""
+        rows, deepest = self.rows, (np.inf,)
+        if len(values) and not values.min() >= -tolerance:
+            row = int(np.argmin(values))
+            numbers = [str(n) for n in rows.numbers[rows.ends[row][rows.ends[row] >= 0]]]
+            deepest = float(values[row]), int(rows.source[row]), int(rows.ids[row]), numbers
+        deepest = min(self.mesh.comm.allgather(deepest))
+        return deepest if len(deepest) > 1 else None
 
     def _check_relative(self) -> None:
         """Refuse rows that would need relative coordinates and can have none. Collective."""

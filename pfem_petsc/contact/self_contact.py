@@ -494,43 +494,38 @@ def measure_pairs(nodes, ends, bars, sizes):
         sizes[3, p] = 1.0 / light
 
 
+@inlined
+def _moved(row, before, i):
+    """Return an element of ``row`` (n,), less that of ``before`` (n,), zero if that is None."""
+    if before is None:
+        return row[i]
+    return row[i] - before[i]
+
+
+@inlined
+def _component(vectors, c):
+    """Return a row of vectors (3, n), or None if these are."""
+    if vectors is None:
+        return None
+    return vectors[c]
+
+
 @kernel
 def largest_move(rows, last, drift, most):
     """Return a distance that no node with the coordinates ``rows`` (3, n) is farther from last (3, n) + drift (3,)
-    than; infinite for positions that are not finite. ``most`` (3,): bounds of the components in the last call, which
-    are found anew where they are too small: comparisons are quicker than maxima."""
+    than, where None stands for ``last`` at zero; infinite for positions that are not finite. ``most`` (3,): bounds of
+    the components in the last call, which are found anew where they are too small: comparisons are quicker than
+    maxima. Of velocities, it is a bound relative to a drift."""
     square = 0.0
     for c in range(3):
-        row, before, shift, limit = rows[c], last[c], drift[c], most[c]
+        row, before, shift, limit = rows[c], _component(last, c), drift[c], most[c]
         beyond = 0
-        for i in range(len(before)):
-            beyond += 0 if abs(row[i] - before[i] - shift) <= limit else 1
+        for i in range(len(row)):
+            beyond += 0 if abs(_moved(row, before, i) - shift) <= limit else 1
         if beyond > 0:
             largest, total = 0.0, 0.0
-            for i in range(len(before)):
-                d = row[i] - before[i] - shift
-                total = add_freely(total, d)
-                largest = max(largest, abs(d))
-            if not np.isfinite(total):
-                return np.inf
-            most[c] = _WIDER * largest
-        square += most[c] * most[c]
-    return np.sqrt(square)
-
-
-@kernel
-def largest_speed(half, drift, most):
-    """Return a bound of the velocities (3, n) of nodes relative to ``drift`` (3,), see :func:`largest_move`."""
-    square = 0.0
-    for c in range(3):
-        speeds, shift, limit = half[c], drift[c], most[c]
-        beyond = 0
-        for i in range(len(speeds)):
-            beyond += 0 if abs(speeds[i] - shift) <= limit else 1
-        if beyond > 0:
-            largest, total = 0.0, 0.0
-            for i in range(len(speeds)):
-                d = speeds[i] - shift
+            for i in range(len(row)):
+                d = _moved(row, before, i) - shift
                 total = add_freely(total, d)
                 largest = max(largest, abs(d))
             if not np.isfinite(total):

@@ -195,7 +195,7 @@ class TouchCaller(Caller):
         if self.asleep[WAY] > 0.0:  # up to the start of this step
             self._pass_over(self._x[: self._half.shape[1]] - stepper.h * self._half.T)
         try:
-            self.sums[:2] = self._touch.evaluate(self._x, self._f, stepper.h, commit=True)
+            self.sums[0], _ = self._touch.evaluate(self._x, self._f, stepper.h, commit=True)
         except SimulationFailure as failure:
             raise SimulationFailure(f"{stepper.at(step, step * stepper.h)}: {failure}") from failure
         self._sleep()

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..columns import BAR_ENERGIES, HEAD, PROBED
-from ..contact.self_contact import largest_speed
+from ..contact.self_contact import largest_move
 from ..mechanics.compiled import addressed, inlined, kernel, record
 from ..mechanics.elements import first_inverted
 from ..mechanics.internal_forces import BarArrays, internal_forces
@@ -191,7 +191,7 @@ class StepArrays(NamedTuple):
     bars; particles of impulses, and their increments (rows, 3) in a step; the nodes of probes; forces of walls (w, 3)
     at the start [N]; energy of bars that touch, what they have lost [J], and their columns of a row (5,); of bars that
     are too far from each other to touch, by how much they may come closer until Python looks again, by how much they
-    have at most [m], and the drift and bounds of :func:`~pfem_petsc.contact.self_contact.largest_speed` (8,); and this
+    have at most [m], and the drift and bounds of :func:`~pfem_petsc.contact.self_contact.largest_move` (8,); and this
     rank's shares (m, width) of the rows of the steps that are due, and at last of the last step if it is not, see
     :class:`~pfem_petsc.columns.Share`."""
 
@@ -320,7 +320,7 @@ def touch_bars(s, step):
     """Have Python add the forces of bars that touch, unless none can have come near enough."""
     asleep, motion = s.asleep, s.motion
     if asleep[WAY_LEFT] > 0.0:
-        way = 2.0 * motion.h * largest_speed(motion.half, asleep[DRIFT : DRIFT + 3], asleep[MOST : MOST + 3])
+        way = 2.0 * motion.h * largest_move(motion.half, None, asleep[DRIFT : DRIFT + 3], asleep[MOST : MOST + 3])
         if asleep[WAY] + way < asleep[WAY_LEFT]:
             asleep[WAY] += way
             return

@@ -4,14 +4,15 @@ bars that intersect walls.
 Nodes do not pass walls, but a bar between them may pass through a sphere, a cylinder or over the edge of a surface of
 triangles. With the least distance g of its axis from the surface, at the part t of its length, the energy of a bar
 there is k/2 min(g, 0)^2. As g is a minimum over t, the force acts at t, and where two faces meet there, along the mean
-of their normals that does not change g along the axis.
+of their normals that does not change g along the axis. Dampers give restitution, and springs across the normal, whose
+force Coulomb's law limits, friction, as between bars (:mod:`~pfem_petsc.contact.self_contact`).
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from math import acosh, asin, exp, pi, sqrt, tan
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -24,8 +25,14 @@ if TYPE_CHECKING:
 _SHARE = 0.2  # of the lighter node's mass over the square of the step, and of what this leaves, that is the stiffness
 _CRITICAL = exp(-2.0)  # restitution of a damper with which nothing swings back; walls with less get it
 _BESIDE = 1e-7  # part of the length at which normals beside the place are taken
-_BEFORE = "bars_before"  # array of the state: positions one step before the last evaluation
+_BISECTIONS = 24  # of the interval in which a bar is deepest
+_NEXT_TO = 1e-6  # way by which positions differ for derivatives, over the length of a bar
+_DEEPER = 0.25  # of the width of a wall, by which an iteration may move bars into it
 _SKIN = 0.5  # distance from a wall up to which bars are listed, over the mean length of bars
+
+SPRING, DAMPER, FORCE, MOMENT, PLACE, WIDTH = 0, 3, 6, 9, 12, 13
+"""Columns of the memory of a bar at a wall: elastic part of the slip [m]; force of the damper, and all of the force on
+the bar [N], and its moment about the origin [N m]; and where it acts, from 0 to 1 along the bar."""
 
 
 def restitution_of(damping: float) -> float:
@@ -65,35 +72,79 @@ def _applying(model: Any, walls: list[int], bars: np.ndarray | slice) -> np.ndar
     return (members[mesh.bars[bars]] > 0.0).all(axis=1)
 
 
+class BarContacts(NamedTuple):
+    """Bars (m,) that may touch a wall: ``stiffness`` (m,) [N/m], and ``inverse`` masses of their nodes (m, 2) [1/kg],
+    zero where supports hold these; ``memory`` (m, WIDTH) of the start of the step, and who ``touched`` (m,) then."""
+
+    stiffness: np.ndarray
+    inverse: np.ndarray
+    memory: np.ndarray
+    touched: np.ndarray
+
+
+class BarMotion(NamedTuple):
+    """A ``step`` [s] of bars (m,) at a wall: their ends ``x`` (m, 2, 3) at its end, and ``before`` [m], and the
+    ``poses`` of walls then, and ``earlier`` ones."""
+
+    x: np.ndarray
+    before: np.ndarray
+    poses: Poses
+    earlier: Poses
+    step: float
+
+
+class Response(NamedTuple):
+    """What a wall does to bars (m,): who touches it (m,); forces on their ends (m, 2, 3) [N], energies stored, and
+    those lost in the step (m,) [J], and what they remember (m, WIDTH)."""
+
+    touch: np.ndarray
+    force: np.ndarray
+    stored: np.ndarray
+    lost: np.ndarray
+    memory: np.ndarray
+
+
 class BarsAtWalls:
     """Bars of this rank, those of ``[self_contact]``, and the walls that they can cross between their nodes.
 
     Attributes
     ----------
     walls : indices of these walls
-    energy : stored in the springs of this rank's counted bars [J]
-    force : (owned, 3) on nodes at the positions of the last evaluation [N]
-    last_step : the step before the last evaluation [s]
-    sums : (2, walls, 3) forces of walls on this rank's counted bars [N], and their moments about the origin [N m]
+    names : of these walls
+    time : of positions that are tried [s]
+    rubs, damped : whether one of the walls has friction, restitution below one
+    force : (owned, 3) on nodes at the positions that were committed last [N]
+    sums : (2, walls, 3) forces of walls on this rank's counted bars there [N], and their moments about the origin [N m]
     """
 
     def __init__(self, model: Any, chosen: np.ndarray) -> None:
         contact, mesh = model.contact, model.mesh
         self._model, self._contact, self._mesh = model, contact, mesh
         self.walls = [k for k in small_walls(contact.walls) if contact.walls[k].closed]
+        self.names = [contact.names[k] for k in self.walls]
         self._bars = np.flatnonzero(chosen)
         counted = np.zeros(len(mesh.bars), dtype=bool)
         counted[mesh.counted] = True
         self._counted = counted[self._bars]
-        self._applies, mass = _applying(model, self.walls, self._bars), np.zeros((mesh.n_local, 1))
-        mass[: mesh.n_owned, 0] = model.inertia.mass
-        mesh.update_ghosts(mass)
-        self._mass = mass[mesh.bars[self._bars], 0]
+        self._applies, of_nodes = _applying(model, self.walls, self._bars), np.zeros((mesh.n_local, 2))
+        of_nodes[: mesh.n_owned, 0] = model.inertia.mass
+        of_nodes[: mesh.n_owned, 1] = np.where(model.supports.fixed.all(axis=1), 0.0, 1.0 / model.inertia.mass)
+        mesh.update_ghosts(of_nodes)
+        self._mass, self._inverse = of_nodes[mesh.bars[self._bars]].transpose(2, 0, 1)
         lengths = model.bars.mesh_lengths[self._bars]
         self._skin = _SKIN * float(lengths.mean()) if len(lengths) else 0.0
         self._near: dict[int, tuple[np.ndarray, np.ndarray]] = {}
-        self._before, self.last_step = mesh.points.copy(), 0.0
-        self.energy, self.force, self.sums = 0.0, np.zeros((mesh.n_owned, 3)), np.zeros((2, len(contact.walls), 3))
+        first = contact.first[self.walls]
+        self.rubs, self.damped = bool(contact.friction[first].any()), bool((contact.restitution[first] < 1.0).any())
+        self.time = 0.0
+        self._before, self.force = mesh.points.copy(), np.zeros((mesh.n_owned, 3))
+        self.sums = np.zeros((2, len(contact.walls), 3))
+        self.take(np.empty((0, 2 + WIDTH)), mesh.points[: mesh.n_owned])
+
+    @property
+    def touches(self) -> bool:
+        """Whether a bar of this rank touches a wall between its nodes."""
+        return len(self._keys) > 0
 
     def _candidates(self, k: int, x: np.ndarray, poses: Poses) -> np.ndarray:
         """Return the bars (m,), of those here, that may cross wall k, with nodes at x (local, 3) [m]."""
@@ -108,77 +159,210 @@ class BarsAtWalls:
         self._near[k] = bars, there.copy()
         return bars
 
-    def evaluate(self, x: np.ndarray, h: float) -> float:
-        """Find the forces at positions x (local, 3) [m], a step of ``h`` [s] after the last ones; return the energy
-        that this rank's counted bars have lost in it [J]."""
-        contact, mesh, before, time = self._contact, self._mesh, self._before, self._contact.state.time
-        poses, earlier = contact.motion.poses(time), contact.motion.poses(time - h)
-        total, sums = np.zeros((len(x), 3)), np.zeros((2, len(contact.walls), 3))
-        self.energy = lost = 0.0
-        for k in self.walls:
-            bars = self._candidates(k, x, poses)
-            ends = mesh.bars[self._bars[bars]]
-            t, gaps = deepest(contact.walls[k].gaps, poses.rest(k, x[ends]))
-            found = gaps < 0.0
+    def _touching(
+        self, x: np.ndarray, step: float, time: float
+    ) -> Iterator[tuple[int, np.ndarray, np.ndarray, BarContacts, BarMotion]]:
+        """For each wall that bars touch at x (local, 3) and a time [s], or have touched before, give its index, the
+        keys of these bars, their ends (m, 2), and their contacts and motion in the step [s]."""
+        contact, bars_here = self._contact, self._mesh.bars[self._bars]
+        poses = contact.motion.poses(time)
+        earlier = poses if self._begun is None else contact.motion.poses(self._begun)
+        for i, k in enumerate(self.walls):
+            near = i * len(self._bars) + self._candidates(k, x, poses)
+            keys = np.union1d(near, self._keys[self._keys // max(len(self._bars), 1) == i])
+            bars = keys - i * len(self._bars)
+            touched = np.isin(keys, self._keys)
+            gaps = deepest(contact.walls[k].gaps, poses.rest(k, x[bars_here[bars]]))[1]
+            found = (gaps < 0.0) | touched
             if not found.any():
                 continue
-            bars, ends, t, gaps = bars[found], ends[found], t[found], gaps[found]
-            weights = np.stack([1.0 - t, t], axis=1)
-            normals = poses.turned(k, self._normals(k, poses.rest(k, x[ends]), t))
-            point, start = (np.einsum("me,mei->mi", weights, at[ends]) for at in (x, before))
-            slip = point - start - earlier.ways(poses, start)[:, k]
-            mobility = (weights**2 / self._mass[bars]).sum(axis=1)
-            # theirs along the axis, unless the step requires less
-            most = _SHARE * self._model.self_contact.room * self._mass[bars].min(axis=1)
-            stiffness = np.minimum(most, self._model.bars.stiffness[self._bars[bars]])
-            closing = np.einsum("mi,mi->m", normals, slip)
-            push = -stiffness * gaps
-            normal = self._damped(k, push, closing, stiffness, mobility, h)
-            along = slip - closing[:, None] * normals / np.einsum("mi,mi->m", normals, normals)[:, None]
-            size = np.linalg.norm(along, axis=1)
-            most = 0.5 * size / (mobility * h * h) if h > 0.0 else size * 0.0
-            drag = np.minimum(contact.friction[contact.first[k]] * normal, most)
-            force = normal[:, None] * normals - (drag / np.maximum(size, 1e-300))[:, None] * along
-            mine = self._counted[bars]
-            self.energy += 0.5 * float((stiffness * gaps * gaps)[mine].sum())
-            half = 0.5 * h * h * mobility  # to the end of the step, by which forces change the way
-            lost += float((drag * (size - half * drag) - (normal - push) * (closing + half * normal))[mine].sum())
-            np.add.at(total, ends, weights[:, :, None] * force[:, None, :])
-            sums[0, k], sums[1, k] = force[mine].sum(axis=0), np.cross(point, force)[mine].sum(axis=0)
-        self.force, self.sums, self._before, self.last_step = total[: mesh.n_owned], sums, x.copy(), h
-        contact.state.memory[_BEFORE] = before[: mesh.n_owned]
-        return lost
+            keys, bars, touched = keys[found], bars[found], touched[found]
+            memory = np.zeros((len(keys), WIDTH))
+            memory[touched] = self._memory[np.searchsorted(self._keys, keys[touched])]
+            stiffness = self._model.bars.stiffness[self._bars[bars]]
+            if self._model.self_contact.room:  # what an explicit step allows
+                most = _SHARE * self._model.self_contact.room * self._mass[bars].min(axis=1)
+                stiffness = np.minimum(most, stiffness)
+            ends = bars_here[bars]
+            here = BarContacts(stiffness, self._inverse[bars], memory, touched)
+            yield k, keys, ends, here, BarMotion(x[ends], self._before[ends], poses, earlier, step)
 
-    def resume(self, x: np.ndarray, h: float) -> None:
-        """Go on at positions (owned, 3) [m] from a checkpoint, written a step of ``h`` [s] after the last evaluation
-        but one. Collective."""
-        mesh, memory, here = self._mesh, self._contact.state.memory, np.zeros_like(self._before)
-        if _BEFORE in memory:
-            for array, values in ((here, x), (self._before, memory[_BEFORE])):
-                array[: mesh.n_owned] = values
-                mesh.update_ghosts(array)
-            self.evaluate(here, h)
+    def add_forces(self, x: np.ndarray, f: np.ndarray, step: float, commit: bool) -> tuple[float, float]:
+        """Add the forces at positions x (local, 3) [m], a ``step`` [s] after those that were committed last, to
+        internal forces ``f`` (local, 3) [N]; return the energy stored by this rank's counted bars, and that lost in the
+        step [J]."""
+        time = self._contact.state.time if commit else self.time
+        total, sums, stored, lost = np.zeros((len(x), 3)), np.zeros_like(self.sums), 0.0, 0.0
+        known = [(np.empty(0, dtype=np.int64), np.empty((0, WIDTH)))]
+        for k, keys, ends, here, motion in self._touching(x, step, time):
+            found = self._respond(k, here, motion)
+            mine = self._counted[keys % len(self._bars)]
+            stored += float(found.stored[mine].sum())
+            lost += float(found.lost[mine].sum())
+            np.add.at(total, ends, found.force)
+            sums[:, k] = found.memory[mine][:, FORCE : MOMENT + 3].sum(axis=0).reshape(2, 3)
+            known.append((keys[found.touch], found.memory[found.touch]))
+        f -= total
+        self._last_sums = sums
+        if commit:
+            self.force, self.sums, self._before[:], self._begun = total[: self._mesh.n_owned], sums, x, time
+            self._keys, self._memory = (np.concatenate(parts) for parts in zip(*known, strict=True))
+        return stored, lost
+
+    def pushes(self, x: np.ndarray, step: float, weight: float) -> np.ndarray:
+        """Return the :attr:`sums` of a balance that has a ``weight`` for the forces at positions x (local, 3), a step
+        [s] after those that were committed last, and the rest for those."""
+        if weight:
+            self.add_forces(x, np.zeros_like(x), step, commit=False)
+            return weight * self._last_sums + (1.0 - weight) * self.sums
+        return self.sums
+
+    def linearise(self, x: np.ndarray, step: float) -> tuple[np.ndarray, np.ndarray]:
+        """Return the ends (m, 2) of bars that touch walls at positions x (local, 3), a step [s] after those that were
+        committed last, and the derivatives (m, 2, 3, 2, 3) of their internal forces by the positions of the ends, as
+        central differences."""
+        found = [(np.empty((0, 2), dtype=np.int64), np.empty((0, 2, 3, 2, 3)))]
+        for k, _, ends, here, motion in self._touching(x, step, self.time):
+            m, size = len(ends), _NEXT_TO * np.linalg.norm(motion.x[:, 1] - motion.x[:, 0], axis=1)
+            moves = np.concatenate([np.eye(6), -np.eye(6)]).reshape(12, 1, 2, 3) * size[:, None, None]
+            tried = motion._replace(x=(motion.x + moves).reshape(-1, 2, 3), before=np.tile(motion.before, (12, 1, 1)))
+            copies = BarContacts(*(np.tile(array, (12, *(array.ndim - 1) * [1])) for array in here))
+            forces = self._respond(k, copies, tried).force.reshape(2, 6, m, 6)
+            slopes = (forces[1] - forces[0]) / (2.0 * size[:, None])
+            found.append((ends, slopes.transpose(1, 2, 0).reshape(m, 2, 3, 2, 3)))
+        ends, blocks = (np.concatenate(parts) for parts in zip(*found, strict=True))
+        return ends, blocks
+
+    def free_part(self, start: np.ndarray, end: np.ndarray) -> tuple[float, str]:
+        """Return the part of the way from positions ``start`` to ``end`` (local, 3) on which no bar here can pass
+        through a wall, and the names of the bar and the wall that limit it."""
+        contact, poses, ends = self._contact, self._contact.motion.poses(self.time), self._mesh.bars[self._bars]
+        least, limiting = 1.0, ""
+        for i, k in enumerate(self.walls):
+            wall = contact.walls[k]
+            room = _DEEPER * wall.width
+            most = np.linalg.norm(end - start, axis=1)[ends].max(axis=1, initial=0.0)
+            fast = np.flatnonzero((most > room) & self._applies[:, i])
+            if len(fast):
+                a, b = poses.rest(k, start)[ends[fast]].swapaxes(0, 1)
+                gaps = wall.gaps(0.5 * (a + b)) - 0.5 * np.linalg.norm(b - a, axis=1)
+                parts = (np.maximum(gaps, 0.0) + room) / most[fast]
+                at = int(np.argmin(parts))
+                if parts[at] < least:
+                    bar = self._mesh.bar_ids[self._bars[fast[at]]]
+                    least, limiting = 0.99 * float(parts[at]), f"bar {bar} and wall {contact.names[k]!r}"
+        return least, limiting
+
+    def table(self) -> np.ndarray:
+        """Return walls, bars and memory (m, 2 + WIDTH) of the counted bars that touch, for a checkpoint."""
+        walls, bars = np.divmod(self._keys, max(len(self._bars), 1))
+        rows = np.column_stack([walls, self._mesh.bar_ids[self._bars[bars]], self._memory])
+        return rows[self._counted[bars]]
+
+    def take(self, table: np.ndarray, x: np.ndarray) -> None:
+        """Go on from bars that touch, rows of :meth:`table` of any ranks, at positions (owned, 3) [m]. Collective."""
+        mesh, n = self._mesh, len(self._bars)
+        state = self._contact.state
+        self._begun = None if state is None else state.time
+        self._before[: mesh.n_owned] = x
+        mesh.update_ghosts(self._before)
+        table = np.concatenate(mesh.comm.allgather(table))
+        ids = mesh.bar_ids[self._bars].astype(np.int64)
+        order, wanted = np.argsort(ids, kind="stable"), table[:, 1].astype(np.int64)
+        place = order[np.minimum(np.searchsorted(ids[order], wanted), n - 1)] if n else wanted
+        here = ids[place] == wanted if n else np.zeros(len(wanted), dtype=bool)
+        keys = (table[:, 0].astype(np.int64) * n + place)[here]
+        ascending = np.argsort(keys)
+        self._keys, self._memory = keys[ascending], table[here][ascending, 2:]
+        self.sums[:], self.force[:] = 0.0, 0.0
+        for i, k in enumerate(self.walls):
+            mine = self._keys[self._keys // max(n, 1) == i] - i * n
+            rows = self._memory[self._keys // max(n, 1) == i][self._counted[mine]]
+            self.sums[:, k] = rows[:, FORCE : MOMENT + 3].sum(axis=0).reshape(2, 3)
+
+    def _respond(self, k: int, here: BarContacts, motion: BarMotion) -> Response:
+        """Return what wall k does to bars."""
+        wall, friction = self._contact.walls[k], self._contact.friction[self._contact.first[k]]
+        rest = motion.poses.rest(k, motion.x)
+        t, gaps, normals = _place(wall, rest)
+        touch = gaps < 0.0
+        t = np.where(touch, t, here.memory[:, PLACE])
+        normals = motion.poses.turned(k, normals)
+        weights = np.stack([1.0 - t, t], axis=1)
+        point, start = (np.einsum("me,mei->mi", weights, ends) for ends in (motion.x, motion.before))
+        slip = point - start - motion.earlier.ways(motion.poses, start)[:, k]
+        stiffness, push = here.stiffness, np.where(touch, -here.stiffness * gaps, 0.0)
+        mobility = (weights**2 * here.inverse).sum(axis=1) + self._wall_mobility(k, point, normals)
+        total = self._damped(k, here, (push, np.einsum("mi,mi->m", normals, slip), mobility), motion.step)
+        damper = (total - push)[:, None] * normals
+        # friction: an elastic slip, turned into the plane across the normal, up to what Coulomb's law allows
+        unit = normals / np.maximum(np.linalg.norm(normals, axis=1), 1e-300)[:, None]
+        old = here.memory[:, SPRING : SPRING + 3]
+        flat, flat_slip = (v - np.einsum("mi,mi->m", v, unit)[:, None] * unit for v in (old, slip))
+        length, left = np.linalg.norm(old, axis=1), np.linalg.norm(flat, axis=1)
+        flat *= np.where(left > 0.0, length / np.maximum(left, 1e-300), 0.0)[:, None]
+        trial = flat + flat_slip
+        size, most = np.linalg.norm(trial, axis=1), friction * total / stiffness
+        end = trial * np.where(size > most, most / np.maximum(size, 1e-300), 1.0)[:, None]
+        force = total[:, None] * normals - stiffness[:, None] * end
+        rubbed = 0.5 * stiffness * np.einsum("mi,mi->m", flat + end, trial - end)
+        before = here.memory[:, DAMPER : DAMPER + 3]
+        lost = rubbed - 0.5 * np.einsum("mi,mi->m", before + damper, slip)
+        stored = np.where(touch, 0.5 * stiffness * (gaps**2 + np.einsum("mi,mi->m", end, end)), 0.0)
+        memory = np.column_stack([end, damper, force, np.cross(point, force), t])
+        return Response(touch, weights[:, :, None] * force[:, None, :], stored, lost, memory)
+
+    def _wall_mobility(self, k: int, point: np.ndarray, normals: np.ndarray) -> np.ndarray | float:
+        """Return the inverse masses [1/kg] with which wall k gives way at points (m, 3) along normals (m, 3)."""
+        bodies = self._contact.motion.bodies
+        for i in np.flatnonzero(bodies.at == k):
+            motions, inertia = bodies.inertias(i)
+            given = motions @ np.concatenate([normals, np.cross(point - bodies.pivots(0.0)[i], normals)], axis=1).T
+            return (given * np.linalg.solve(inertia, given)).sum(axis=0)
+        return 0.0
 
     def _damped(
-        self, k: int, push: np.ndarray, closing: np.ndarray, stiffness: np.ndarray, mobility: np.ndarray, h: float
+        self, k: int, here: BarContacts, spring: tuple[np.ndarray, np.ndarray, np.ndarray], step: float
     ) -> np.ndarray:
-        """Return the forces (m,) of springs with a damper, which pull never [N]; the velocity is that at the end of the
-        step, half a step later, by the force itself."""
+        """Return the forces (m,) of springs with a damper, which pull never [N], from ``push``, closing way and
+        mobility (m,) of each ``spring``; in explicit steps the velocity is that at the end of the step, half a step
+        later, by the force itself. In steps that solve equations, which had no solution if a force jumped, dampers of
+        bars that begin to touch follow a step later."""
         restitution = float(self._contact.restitution[self._contact.first[k]])
-        if restitution >= 1.0 or h <= 0.0:
+        push, closing, mobility = spring
+        if restitution >= 1.0 or step <= 0.0:
             return push
-        drag = 2.0 * damping_of(max(restitution, _CRITICAL)) * np.sqrt(stiffness / mobility)
-        return np.maximum((push - drag * closing / h) / (1.0 + 0.5 * drag * h * mobility), 0.0)
+        implicit = self._model.self_contact.implicit
+        ratio = 2.0 * damping_of(max(restitution, _CRITICAL))
+        drag = ratio * np.sqrt(here.stiffness / np.maximum(mobility, 1e-300)) * (mobility > 0.0)
+        total = (push - drag * closing / step) / (1.0 + (0.0 if implicit else 0.5) * drag * step * mobility)
+        return np.where(push > 0.0 if not implicit else here.touched & (push > 0.0), np.maximum(total, 0.0), push)
 
-    def _normals(self, k: int, ends: np.ndarray, t: np.ndarray) -> np.ndarray:
-        """Return the derivatives (m, 3) of the least distances by the positions of the places ``t`` (m,)."""
-        along = ends[:, 1] - ends[:, 0]
-        points, wall = ends[:, 0] + t[:, None] * along, self._contact.walls[k]
-        behind, ahead = (wall.planes(points + side * _BESIDE * along)[0] for side in (-1.0, 1.0))
-        falls, rises = (np.einsum("mi,mi->m", normal, along) for normal in (behind, ahead))
-        share = np.where(rises > falls, np.clip(rises / np.where(rises > falls, rises - falls, 1.0), 0.0, 1.0), 0.5)
-        mean = share[:, None] * behind + (1.0 - share)[:, None] * ahead
-        return mean - (np.einsum("mi,mi->m", mean, along) / np.einsum("mi,mi->m", along, along))[:, None] * along
+
+def _place(wall: BaseWall, ends: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return where bars with ends (m, 2, 3) are deepest beyond a wall at rest, from 0 to 1, the distances there (m,)
+    [m], see :func:`~pfem_petsc.contact.walls.base.deepest`, and the derivatives (m, 3) of these by the positions of the
+    places."""
+    t, gaps = deepest(wall.gaps, ends)
+    along = ends[:, 1] - ends[:, 0]
+
+    def at(t: np.ndarray) -> np.ndarray:
+        return ends[:, 0] + t[:, None] * along
+
+    # where the distance begins to grow along the bar, to rounding
+    low, high = np.maximum(t - 2.0 * _BESIDE, 0.0), np.minimum(t + 2.0 * _BESIDE, 1.0)
+    for _ in range(_BISECTIONS):
+        middle = 0.5 * (low + high)
+        falls = np.einsum("mi,mi->m", wall.planes(at(middle))[0], along) < 0.0
+        low, high = np.where(falls, middle, low), np.where(falls, high, middle)
+    t = 0.5 * (low + high)
+    gaps = np.where(np.isfinite(gaps), wall.gaps(at(t)), gaps)
+    behind, ahead = (wall.planes(at(t + side * _BESIDE))[0] for side in (-1.0, 1.0))
+    falls, rises = (np.einsum("mi,mi->m", normal, along) for normal in (behind, ahead))
+    share = np.where(rises > falls, np.clip(rises / np.where(rises > falls, rises - falls, 1.0), 0.0, 1.0), 0.5)
+    mean = share[:, None] * behind + (1.0 - share)[:, None] * ahead
+    square = np.maximum(np.einsum("mi,mi->m", along, along), 1e-300)
+    return t, gaps, mean - (np.einsum("mi,mi->m", mean, along) / square)[:, None] * along
 
 
 class Piercing:

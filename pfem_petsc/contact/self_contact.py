@@ -31,6 +31,7 @@ pattern, which begins anew with each problem and grows with its iterations.
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from math import inf
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -46,6 +47,7 @@ from ..mesh.slab import slab_of, slab_range
 from ..output.units import engineering
 from ..parallel.agreement import agreed
 from ..parallel.natural import NaturalOrder
+from .bars_at_walls import WIDTH as BAR_WIDTH
 from .bars_at_walls import BarsAtWalls, damping_of
 from .neighbours import (
     Points,
@@ -61,6 +63,7 @@ from .rows import owner_starts, to_owners
 
 if TYPE_CHECKING:
     from ..integrators.base import Balance, Scheme
+    from .node_walls import WallForces
 
 Turns = tuple[np.ndarray, np.ndarray, np.ndarray] | None
 """See :meth:`~pfem_petsc.contact.transform.Transform.turns`."""
@@ -574,7 +577,8 @@ class SelfContact:
     deepest : largest overlap so far over the radius
     stale : whether bars have left the model since the last search
     implicit : whether steps solve equations
-    between : the last bars that would have passed through each other in an iteration of such a step, empty for none
+    between : the last bars, or bar and wall, that would have passed through each other in an iteration of such a step,
+        empty for none
 
     Raises
     ------
@@ -620,7 +624,7 @@ class SelfContact:
         ends, stiffness = self._numbers[mesh.bars[self._bars]], model.bars.stiffness[self._bars]
         self._directory[at] = router.send(np.column_stack([ends, self._radius[self._bars], stiffness]))
         self._h, self.room, self.implicit, self._steps = 0.0, 0.0, False, "time.step"
-        self.between: tuple[int, ...] = ()
+        self.between = ""
         self.dissipated, self.deepest, self.stale = 0.0, 0.0, False
         self.sums = np.zeros(6)
         self._way, self._limit, self._drift, self._most = 0.0, 0.0, np.zeros(3), np.zeros(3)
@@ -678,7 +682,12 @@ class SelfContact:
                 "[modes]",
                 "their stiffness has no contact: give the table to the stages before only",
             ),
-            (walls, f"walls {', '.join(walls)}, which bars touch between their nodes,", explicit),
+            (
+                walls and scheme.discrete_gradient,
+                f"walls {', '.join(walls)}, which bars touch between their nodes, with time.integrator = "
+                f'"{scheme_name}"',
+                "use another integrator",
+            ),
             (self._model.links, "[[contact_pair]] or [[constraint]]", explicit),
             (scheme.discrete_gradient and not self.symmetric, f'time.integrator = "{scheme_name}"', conserves),
         ):
@@ -704,7 +713,19 @@ class SelfContact:
     @property
     def symmetric(self) -> bool:
         """Whether the derivative of the forces is symmetric: without friction and damping."""
-        return not self._friction and not self._damping
+        alone = self.at_walls is None or not (self.at_walls.rubs or self.at_walls.damped)
+        return alone and not self._friction and not self._damping
+
+    @property
+    def touches(self) -> bool:
+        """Whether bars of this rank touch others or, between their nodes, walls."""
+        return self.sums[CONTACTS] > 0.0 or (self.at_walls is not None and self.at_walls.touches)
+
+    def begin_solve(self, time: float) -> None:
+        """Take the time of the positions that are tried from now on [s]."""
+        self.between = ""
+        if self.at_walls is not None:
+            self.at_walls.time = time
 
     def text(self) -> str:
         """Return what can touch, for the user before a run. Collective."""
@@ -723,7 +744,7 @@ class SelfContact:
         """Return what to add to the message about a solve that did not converge. Collective."""
         depth = self.comm.allreduce(float(self.sums[DEPTH]), op=MPI.MAX)
         if self.between:
-            return ". Bars {} and {} would have passed through each other in an iteration".format(*self.between)
+            return f". {self.between[0].upper()}{self.between[1:]} would have passed through each other in an iteration"
         return f". Bars overlap by {100.0 * depth:.0f} % of a radius" if depth > _DEEP else ""
 
     # pairs
@@ -853,8 +874,8 @@ class SelfContact:
 
     def evaluate(self, x: np.ndarray, f: np.ndarray, step: float, commit: bool) -> tuple[float, float]:
         """Add the forces of bars at positions ``x``, a ``step`` [s] after the last that were committed, to ``f``, both
-        (local, 3), and find those of walls between nodes, if they are committed; return the stored energy and all that
-        is dissipated [J]. Collective.
+        (local, 3), with those of walls between nodes; return the stored energy and all that is dissipated [J].
+        Collective.
 
         Forces that are not a number stand for bars of a trial that have passed through each other.
 
@@ -885,9 +906,24 @@ class SelfContact:
             self.deepest = max(self.deepest, float(sums[DEPTH]))
         stored = float(sums[ENERGY])
         if self.at_walls is not None:
-            self.dissipated += self.at_walls.evaluate(x, step) if commit else 0.0
-            stored += self.at_walls.energy
+            more, lost = self.at_walls.add_forces(x, f, step, commit)
+            stored += more
+            self.dissipated += lost if commit else 0.0
         return stored, self.dissipated
+
+    def pushes(self, x: np.ndarray, weight: float) -> np.ndarray:
+        """Return forces and moments (2, walls, 3) of walls on bars of this rank between their nodes, in a balance that
+        has a ``weight`` for the forces at positions x (local, 3), and the rest for those that were committed last."""
+        if self.at_walls is None:
+            return np.zeros((2, len(self._model.contact.walls), 3))
+        return self.at_walls.pushes(x, self._step, weight)
+
+    def with_walls(self, walls: WallForces, x: np.ndarray, weight: float) -> WallForces:
+        """Return forces of walls with the :meth:`pushes` of such a balance."""
+        if self.at_walls is None:
+            return walls
+        force, moment = self.pushes(x, weight)
+        return replace(walls, force=walls.force + force, moment=walls.moment + moment)
 
     def way_left(self) -> float:
         """Return how far bars may come closer until :meth:`evaluate` is needed again [m]: zero unless this is known on
@@ -955,8 +991,10 @@ class SelfContact:
         """Return what the pairs that touch add to the Hessian of a balance at positions (local, 3), in coordinates with
         these ``turns``: owned nodes (k,), PETSc's numbers of others (k,), and blocks (k, 3, 3). Collective."""
         arrays, state, law = self._look(x, self._step, False) or (None, None, None)
+        none = np.empty(0, dtype=np.int64), np.empty(0, dtype=np.int64), np.empty((0, 3, 3))
+        at_walls = none if self.at_walls is None else self._linearise_walls(x, balance, turns)
         if state is None:
-            return np.empty(0, dtype=np.int64), np.empty(0, dtype=np.int64), np.empty((0, 3, 3))
+            return at_walls
         chosen = np.flatnonzero(state != APART)
         ends, blocks = self._pairs.ends[chosen], np.empty((len(chosen), 12, 12))
         differentiate_pairs(self._pairs, state, self._memory, arrays, law, balance.discrete_gradient, blocks)
@@ -968,7 +1006,25 @@ class SelfContact:
         rows, columns = np.repeat(ends, 4, axis=1).ravel(), np.tile(ends, 4).ravel()
         own, numbers = self._own[rows], self._at
         rows, columns = numbers[rows[own]] - self._mesh.first_node, numbers[columns[own]]
-        return rows, columns, blocks.reshape(-1, 3, 3)[own]
+        found = rows, columns, blocks.reshape(-1, 3, 3)[own]
+        return tuple(np.concatenate(parts) for parts in zip(found, at_walls, strict=True))
+
+    def _linearise_walls(
+        self, x: np.ndarray, balance: Balance, turns: Turns
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """As :meth:`linearise`, for bars that touch walls between their nodes. Collective."""
+        mesh, (ends, blocks) = self._mesh, self.at_walls.linearise(x, self._step)
+        coordinates = np.zeros((mesh.n_local, 18))
+        if self._any(len(ends)):
+            coordinates[: mesh.n_owned] = self._coordinates(turns)(np.arange(mesh.n_owned))
+            mesh.update_ghosts(coordinates)
+        left, right = coordinates.reshape(-1, 2, 3, 3).transpose(1, 0, 2, 3)
+        if self.symmetric:
+            blocks = 0.5 * (blocks + blocks.transpose(0, 3, 4, 1, 2))
+        blocks = balance.weight * left[ends][:, :, None] @ blocks.transpose(0, 1, 3, 2, 4) @ right[ends][:, None]
+        rows, columns = np.repeat(ends, 2, axis=1).ravel(), np.tile(ends, 2).ravel()
+        own = rows < mesh.n_owned
+        return rows[own], self._numbers[columns[own]], blocks.reshape(-1, 3, 3)[own]
 
     def _coordinates(self, turns: Turns) -> Callable[[np.ndarray], np.ndarray]:
         """Return what gives owned nodes (k,) the matrices (k, 18) by which the rows and the columns of their Hessian
@@ -995,12 +1051,15 @@ class SelfContact:
     def free_part(self, start: np.ndarray, end: np.ndarray) -> float:
         """Return the part of the way from positions ``start`` to ``end``, both (local, 3), on which no bar passes
         through another, see :func:`free_part`; 1 for all of it. Collective."""
-        found = self._look(end, self._step, False)
-        if found is None or found[1] is None:
-            return 1.0
-        x = self._gather(lambda rows: start[rows], 3)
-        part, limiting = free_part(self._pairs, x, found[0].x[:, :3] - x)
-        part, between = min(self.comm.allgather((part, tuple(self.ids[limiting - 1].tolist()) if limiting else ())))
+        found, parts = self._look(end, self._step, False), [(1.0, "")]
+        if found is not None and found[1] is not None:
+            x = self._gather(lambda rows: start[rows], 3)
+            part, limiting = free_part(self._pairs, x, found[0].x[:, :3] - x)
+            if limiting:
+                parts.append((part, "bars {} and {}".format(*self.ids[limiting - 1].tolist())))
+        if self.at_walls is not None:
+            parts.append(self.at_walls.free_part(start, end))
+        part, between = min(self.comm.allgather(min(parts)))
         self.between = between or self.between
         return part
 
@@ -1041,10 +1100,15 @@ class SelfContact:
 
     def arrays(self) -> dict[str, tuple[NaturalOrder, np.ndarray]]:
         """What a checkpoint keeps, name to an order and this rank's part. Collective."""
-        table = self._table()
-        counts = self.comm.allgather(len(table))
-        order = NaturalOrder(self.comm, sum(counts[: self.comm.rank]) + np.arange(len(table)), sum(counts))
-        return {"self_contact.pairs": (order, table)} if sum(counts) else {}
+        tables = {"self_contact.pairs": self._table()}
+        if self.at_walls is not None:
+            tables["self_contact.walls"] = self.at_walls.table()
+        kept = {}
+        for name, table in tables.items():
+            counts = self.comm.allgather(len(table))
+            order = NaturalOrder(self.comm, sum(counts[: self.comm.rank]) + np.arange(len(table)), sum(counts))
+            kept |= {name: (order, table)} if sum(counts) else {}
+        return kept
 
     def _table(self) -> np.ndarray:
         """Return numbers and memory (m, width + 3) of the counted pairs that touch."""
@@ -1057,14 +1121,17 @@ class SelfContact:
         return {
             "pairs": self.comm.allreduce(len(self._table())),
             "deepest": self.comm.allreduce(self.deepest, op=MPI.MAX),
-            "last_step": 0.0 if self.at_walls is None else self.at_walls.last_step,
+            "walls": 0 if self.at_walls is None else self.comm.allreduce(len(self.at_walls.table())),
         }
 
     def orders(self, numbers: dict[str, Any]) -> dict[str, NaturalOrder]:
         """Return the orders in which :meth:`load_state` takes the arrays of a checkpoint with these numbers."""
-        n, comm = numbers["pairs"], self.comm
-        slab = NaturalOrder(comm, np.arange(*slab_range(n, comm.rank, comm.size)), n)
-        return {"self_contact.pairs": slab} if n else {}
+        comm, counts = self.comm, {name: numbers[name] for name in ("pairs", "walls")}
+        return {
+            f"self_contact.{name}": NaturalOrder(comm, np.arange(*slab_range(n, comm.rank, comm.size)), n)
+            for name, n in counts.items()
+            if n
+        }
 
     def load_state(
         self, numbers: dict[str, Any], arrays: dict[str, np.ndarray], x: np.ndarray, dissipated: float
@@ -1074,7 +1141,7 @@ class SelfContact:
         self.deepest, self.dissipated = float(numbers["deepest"]), dissipated
         self._take(arrays.get("self_contact.pairs", np.empty((0, WIDTH + 3))), x)
         if self.at_walls is not None:
-            self.at_walls.resume(x, float(numbers["last_step"]))
+            self.at_walls.take(arrays.get("self_contact.walls", np.empty((0, 2 + BAR_WIDTH))), x)
 
     def overlap_at_start(self, earlier: SelfContact | None) -> float:
         """Return the largest overlap [m] of bars at the start of a stage that other bars or radii of the stage before,
@@ -1089,6 +1156,10 @@ class SelfContact:
         if earlier is not None:
             self.deepest, self.dissipated, table = earlier.deepest, earlier.dissipated, earlier._table()
         self._take(table, x)
+        if self.at_walls is not None:
+            before = None if earlier is None else earlier.at_walls
+            same = before is not None and before.names == self.at_walls.names
+            self.at_walls.take(before.table() if same else np.empty((0, 2 + BAR_WIDTH)), x)
 
     def _take(self, table: np.ndarray, x: np.ndarray) -> None:
         """Take pairs that touch (m, width + 3) from any ranks to those of their nodes. Collective."""

@@ -11,7 +11,6 @@ import numpy as np
 from mpi4py import MPI
 from petsc4py import PETSc
 
-from ..contact.self_contact import CONTACTS
 from ..errors import InputError, NotConverged, SimulationFailure
 from ..integrators.base import Balance
 from ..mechanics.materials.base import law_name, law_of
@@ -399,7 +398,7 @@ class StaticStepper(ImplicitStepper):
     def _untouched(self) -> bool:
         """Return whether contact is possible and nothing is in contact at the start of the increment. Collective."""
         model = self.model
-        touched = self.state.contact.any() or (model.self_contact is not None and model.self_contact.sums[CONTACTS] > 0)
+        touched = self.state.contact.any() or (model.self_contact is not None and model.self_contact.touches)
         return model.touches and not model.comm.allreduce(int(touched), op=MPI.MAX)
 
     def resume(self) -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING
 
@@ -80,10 +79,8 @@ class ExplicitStepper(Stepper):
             stiffness += balance.eta * inertia.damping
             load -= inertia.damping[:, None] * balance.v_hat
         u, state.contact = load / stiffness[:, None], self.zero
-        between = None if model.self_contact is None else model.self_contact.at_walls
-        if between is not None:
-            state.contact, model.contact.pushes = between.force.copy(), between.sums
-            u += state.contact / stiffness[:, None]
+        if model.self_contact is not None:
+            model.contact.pushes = model.self_contact.pushes(state.x, 0.0)
         if supports.any:
             supports.put(u, supports.lacking(balance.predictor, balance.time))
         walls, held, bodies = model.contact.nothing, self._nobody, model.contact.motion.bodies
@@ -107,9 +104,8 @@ class ExplicitStepper(Stepper):
                     if state.contact is self.zero:
                         state.contact = np.zeros_like(u)
                     state.contact[held] += force
-        if between is not None:
-            force, moment = between.sums
-            walls = replace(walls, force=walls.force + force, moment=walls.moment + moment)
+        if model.self_contact is not None:
+            walls = model.self_contact.with_walls(walls, state.x, 0.0)
         if supports.any:
             state.support = supports.part(stiffness[:, None] * u - load - state.contact)
         return Solution(u, state.f, walls, contacts=model.links.count_held(held))

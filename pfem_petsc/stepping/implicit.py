@@ -275,13 +275,16 @@ class ImplicitStepper(Stepper):
 
     def _with_walls(self, balance: Balance) -> Solution:
         """Solve a balance together with the motion of walls with mass. Collective."""
-        bodies = self.model.contact.motion.bodies
+        bodies, touch = self.model.contact.motion.bodies, self.model.self_contact
         guess = self._guess(balance)
         found: list[Solution] = []
 
         def forces() -> tuple[np.ndarray, None]:
             found.append(self._solve(balance, found[-1].u if found else guess))
             walls = found[-1].walls
+            if touch is not None:
+                x = self.with_ghosts(balance.predictor + found[-1].u)
+                walls = found[-1].walls = touch.with_walls(walls, x, balance.weight)
             return np.stack([walls.force, walls.moment])[:, bodies.at], None
 
         if not bodies.solve(forces, ON_BOUND * self.model.size):
@@ -367,16 +370,16 @@ class ImplicitStepper(Stepper):
         """
         start, supports, touch = self.state.x, self.model.supports, self.model.self_contact
         back = self.state.position - balance.predictor
-        lacking, touch.between = supports.lacking(balance.predictor, balance.time), ()
+        lacking = supports.lacking(balance.predictor, balance.time)
+        touch.begin_solve(balance.time)
         for _ in range(_APPROACHES):
             part = touch.free_part(start, self.with_ghosts(balance.predictor + guess))
             if part == 1.0:
                 return guess
             guess = back + part * (guess - back)
             supports.put(guess, lacking)
-        one, other = touch.between
         raise NotConverged(
-            f"{self.when(balance)}: supports would move bars {one} and {other} through each other; {self.remedy}",
+            f"{self.when(balance)}: supports would move {touch.between} through each other; {self.remedy}",
             "supports move bars through each other",
         )
 

@@ -12,6 +12,7 @@ from pfem_petsc.contact.bars_at_walls import damping_of
 BALL = {"type": "sphere", "point": [0.0, 0.0, 0.0], "radius": 0.5}
 ACROSS = [[-1.0, 0.0, 0.52], [1.0, 0.0, 0.52]]
 MASS = 0.2
+EXPLICIT = "central_differences", "chung_lee"
 
 
 def falling(wall, points=ACROSS, velocity=(0.0, 0.0, -1.0), step=2e-4, end=0.12, **tables):
@@ -30,37 +31,48 @@ def falling(wall, points=ACROSS, velocity=(0.0, 0.0, -1.0), step=2e-4, end=0.12,
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("integrator", ["central_differences", "chung_lee"])
+@pytest.mark.parametrize("integrator", ["central_differences", "chung_lee", "generalized_alpha", "bathe"])
 @pytest.mark.parametrize("restitution", [1.0, 0.5, 0.2])
 def test_bar_that_falls_on_a_sphere(integrator, restitution, comm, shared_tmp_path):
     """Its middle hits the sphere, and it leaves with e times its velocity; the energies of its own account for it."""
     case = falling({**BALL, "restitution": restitution})
     case["time"]["integrator"] = integrator
+    # dampers of implicit steps follow a step later
+    error = 0.01 if integrator in EXPLICIT or restitution == 1.0 else 0.03
     rows, run = rows_of(case, comm, shared_tmp_path)
-    np.testing.assert_allclose(run.state.v[:, 2], restitution, rtol=0.01)
+    np.testing.assert_allclose(run.state.v[:, 2], restitution, rtol=error)
     last = rows[-1]
     given = comm.allreduce(float(run.state.v[:, 2].sum())) * 0.5 * MASS + MASS
     np.testing.assert_allclose(last["wall/w/impulse"], [0.0, 0.0, given], atol=1e-12)
     lost = 0.5 * MASS - last["kinetic_energy"]
-    assert last["self_contact_dissipation"] == pytest.approx(lost, abs=1e-4)
+    assert last["self_contact_dissipation"] == pytest.approx(lost, abs=0.01 * error)
     damping = damping_of(restitution)  # most energy of a damped oscillator from rest: at its largest deflection
     stored = 0.5 * MASS * np.exp(-2.0 * damping / np.sqrt(1.0 - damping**2) * np.arccos(damping))
-    assert max(row["self_contact_energy"] for row in rows) == pytest.approx(stored, rel=0.02)
-    assert abs(last["numerical_dissipation"]) < 1e-4
+    assert max(row["self_contact_energy"] for row in rows) == pytest.approx(stored, rel=0.01 + 2.0 * error)
+    assert abs(last["numerical_dissipation"]) < 0.01 * error
 
 
-def test_sphere_with_mass_and_bar(comm, shared_tmp_path):
-    """An elastic impact of free bodies: v1 = (m1 - m2)/(m1 + m2) v, and both keep the momentum."""
-    case = falling({**BALL, "restitution": 1.0, "mass": 0.4})
+@pytest.mark.parametrize("integrator", ["central_differences", "generalized_alpha"])
+def test_sphere_with_mass_and_bar(integrator, comm, shared_tmp_path):
+    """Free bodies leave with e times the velocity at which they met, and both keep the momentum. Walls with mass have
+    restitution in central differences only; without it the damper is critical, e = exp(-2)."""
+    case, restitution = falling({**BALL, "mass": 0.4}), np.exp(-2.0)
+    case["time"]["integrator"] = integrator
+    if integrator in EXPLICIT:
+        case["wall"][0]["restitution"] = restitution = 1.0
     rows, run = rows_of(case, comm, shared_tmp_path)
-    np.testing.assert_allclose(run.state.v[:, 2], -(0.2 - 0.4) / 0.6, rtol=2e-3)
+    after = -(0.2 - 0.4 * restitution) / 0.6
+    np.testing.assert_allclose(run.state.v[:, 2], after, rtol=2e-3 if integrator in EXPLICIT else 0.02)
     of_wall = 0.4 * rows[-1]["wall/w/velocity"][2]
     assert 0.5 * MASS * run.state.v[:, 2].sum() + of_wall == pytest.approx(-MASS, abs=1e-13)
 
 
-def test_wall_that_moves_works_on_the_bar(comm, shared_tmp_path):
+@pytest.mark.parametrize("integrator", ["central_differences", "generalized_alpha"])
+def test_wall_that_moves_works_on_the_bar(integrator, comm, shared_tmp_path):
     """Seen from a sphere that rises the impact is the same: the bar leaves with v + 2 V, and the wall works V J."""
-    rows, run = rows_of(falling({**BALL, "restitution": 1.0, "velocity": [0.0, 0.0, 0.5]}), comm, shared_tmp_path)
+    case = falling({**BALL, "restitution": 1.0, "velocity": [0.0, 0.0, 0.5]})
+    case["time"]["integrator"] = integrator
+    rows, run = rows_of(case, comm, shared_tmp_path)
     np.testing.assert_allclose(run.state.v[:, 2], 2.0, rtol=2e-3)
     last = rows[-1]
     assert last["contact_work"] == pytest.approx(0.5 * last["wall/w/impulse"][2], rel=1e-10)
@@ -68,11 +80,13 @@ def test_wall_that_moves_works_on_the_bar(comm, shared_tmp_path):
 
 
 @pytest.mark.slow
-def test_bar_across_the_edge_of_a_box(comm, shared_tmp_path):
+@pytest.mark.parametrize("integrator", ["central_differences", "generalized_alpha"])
+def test_bar_across_the_edge_of_a_box(integrator, comm, shared_tmp_path):
     """A bar that falls across the edge of a box of triangles is pushed across the edge and its axis."""
     file = write_surface(shared_tmp_path / "box.obj", *box((-1.0, -1.0, -1.0), (1.0, 1.0, 0.0)), comm)
     points = [[0.51, 0.0, 0.51], [1.51, 0.0, -0.49]]
     case = falling({"type": "surface", "file": file, "restitution": 1.0}, points, (-0.5, 0.0, -0.5))
+    case["time"]["integrator"] = integrator
     _, run = rows_of(case, comm, shared_tmp_path)
     assert comm.allreduce(float(run.state.v[:, 1].sum())) == pytest.approx(0.0, abs=1e-12)
     np.testing.assert_allclose(run.state.v[:, [0, 2]], 0.5, rtol=0.01)  # it was hit in its middle
@@ -93,7 +107,7 @@ def test_bar_rests_between_its_nodes(comm, shared_tmp_path):
 
 
 @pytest.mark.parallel
-@pytest.mark.parametrize("integrator", ["central_differences", "chung_lee"])
+@pytest.mark.parametrize("integrator", ["central_differences", "chung_lee", "generalized_alpha"])
 def test_on_any_rank_count_and_restarted(integrator, comm, shared_tmp_path):
     wall = {**BALL, "friction": 0.3, "restitution": 0.4}
     wall["rotation"] = {"centre": [0.0, 0.0, 0.0], "axis": [1.0, 0.0, 0.0], "angular_velocity": 4.0}
@@ -101,9 +115,55 @@ def test_on_any_rank_count_and_restarted(integrator, comm, shared_tmp_path):
     case = falling(wall, points, (0.0, 0.3, -1.0), step=4e-4, end=0.03)
     case["mesh"]["bars"] = [[0, 1], [1, 2]]
     case["time"]["integrator"] = integrator
-    if integrator == "chung_lee":  # which has no restitution beside friction
+    if integrator != "central_differences":  # which alone has restitution beside friction
         del case["wall"][0]["restitution"]
     case = Case.from_dict(case)
     history = assert_restart_is_bitwise(case, comm, shared_tmp_path, 55, 63)
     names = "momentum", "kinetic_energy", "self_contact_dissipation", "wall/w/impulse", "wall/w/moment"
     assert_as_on_one_rank(history, case, comm, shared_tmp_path, *names)
+
+
+def at_rest(wall, **table):
+    """A bar on springs, which a wall that moves with the load factor presses between its nodes."""
+    case = falling({**wall, **table})
+    del case["time"], case["initial"]
+    return {
+        **case,
+        "node_set": {"both": {"indices": [0, 1]}},
+        "spring": [{"node_set": "both", "stiffness": [200.0, 300.0, 100.0]}],
+        "static": {"method": "newton", "step": 0.05},
+        "output": {"fields_every": 0},
+    }
+
+
+CYLINDER = {"type": "cylinder", "point": [0.0, 0.0, 0.0], "axis": [0.0, 1.0, 0.0], "radius": 0.5}
+
+
+@pytest.mark.parallel
+@pytest.mark.parametrize("wall", [BALL, CYLINDER], ids=["sphere", "cylinder"])
+def test_wall_presses_a_bar_on_springs(wall, comm, shared_tmp_path):
+    """Statics: the springs at both ends and that of the contact, k = E A/l, in series, F = g/(1/k + 1/(2 c))."""
+    case = at_rest(wall, motion=[[0.0, 0.0, 0.0, 0.0], [1.0, 0.0, 0.0, 0.05]])
+    rows, run = rows_of(case, comm, shared_tmp_path)
+    force = 0.03 / (1.0 / 500.0 + 1.0 / 200.0)
+    assert rows[-1]["wall/w/force"][2] == pytest.approx(force, rel=1e-9)
+    np.testing.assert_allclose(run.state.position[:, 2], 0.52 + force / 200.0, rtol=1e-9)
+    assert rows[-1]["self_contact_energy"] == pytest.approx(0.5 * force**2 / 500.0, rel=1e-9)
+    assert abs(rows[-1]["energy_imbalance"]) < 1e-12
+
+
+def test_wall_rubs_a_bar_on_springs(comm, shared_tmp_path):
+    """Statics: a cylinder drags the bar along until friction slips, then the force is on Coulomb's cone; the work of
+    the wall is stored, or dissipated."""
+    motion = [[0.0, 0.0, 0.0, 0.0], [0.5, 0.0, 0.0, 0.05], [1.0, 0.2, 0.0, 0.05]]
+    rows, run = rows_of(at_rest(CYLINDER, motion=motion, friction=0.3), comm, shared_tmp_path)
+    x = run.state.position
+    along = (x[1] - x[0]) / np.linalg.norm(x[1] - x[0])
+    force = np.array(rows[-1]["wall/w/force"])
+    pushed = force @ along
+    assert pushed == pytest.approx(0.3 * np.sqrt(force @ force - pushed**2), rel=1e-6)
+    assert pushed > 0.0 and abs(force[1]) < 1e-12
+    assert rows[-1]["self_contact_dissipation"] > 0.1 * rows[-1]["contact_work"] > 0.0
+    assert max(abs(row["energy_imbalance"]) for row in rows) < 1e-12
+    stuck = [row["self_contact_dissipation"] for row in rows if row["load_factor"] <= 0.5]
+    assert max(stuck) < 1e-12

@@ -460,7 +460,7 @@ SPHERE = [{"name": "ball", "type": "sphere", "point": [0.0, 0.0, -3.0], "radius"
     [
         ({"self_contact": {"friction": 0.1}}, 'does not serve time.integrator = "energy_momentum"'),
         ({"self_contact": {"restitution": 0.5}}, 'does not serve time.integrator = "energy_momentum"'),
-        ({"wall": SPHERE}, "does not serve walls 'ball', which bars touch between their nodes"),
+        ({"wall": SPHERE}, "does not serve walls 'ball', which bars touch between their nodes, with time.integrator"),
         ({"solver": {"operator": "matrix_free"}, "time": NEWMARK | {"step": 1e-5, "end": 1e-4}}, "needs a matrix"),
         ({"solver": {"linear": "multigrid"}, "time": NEWMARK | {"step": 1e-5, "end": 1e-4}}, "needs a matrix"),
     ],

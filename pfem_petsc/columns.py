@@ -330,7 +330,7 @@ FIELDS = [
     Field("displacement", "nodes", "m", lambda now: now.state.position - now.start),
     Field("velocity", "nodes", "m/s", lambda now: now.state.v.copy()),
     Field("acceleration", "nodes", "m/s²", lambda now: now.acceleration().copy()),
-    Field("contact_force", "nodes", "N", lambda now: now.state.contact.copy()),
+    Field("contact_force", "nodes", "N", lambda now: now.contact_force()),
     Field("strain", "bars", "", lambda now: now.bars["strain"]),
     Field("stress", "bars", "Pa", lambda now: now.bars["stress"]),
     Field("axial_force", "bars", "N", lambda now: now.bars["axial_force"]),
@@ -375,6 +375,12 @@ class Snapshot:
         """(local bars,) temperature above reference [K], zero if the case has none."""
         temperatures = self.model.temperatures
         return temperatures.values.copy() if temperatures.any else 0.0 * self.bars["strain"]
+
+    def contact_force(self) -> np.ndarray:
+        """(owned, 3) force of walls and rows on nodes, and of walls on bars between them [N]."""
+        touch = self.model.self_contact
+        between = 0.0 if touch is None or touch.at_walls is None else touch.at_walls.force
+        return self.state.contact + between
 
 
 class Fields:

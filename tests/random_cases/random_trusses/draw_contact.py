@@ -189,7 +189,7 @@ def draw_bars_touch(chance: random.Random, case: dict[str, Any], body: Body, mot
         return
     if not explicit and (case.get("contact_pair") or case.get("constraint")):
         return
-    if not explicit and any(wall["type"] not in ("plane", "rectangle") for wall in case.get("wall", ())):
+    if scheme == "energy_momentum" and any(w["type"] not in ("plane", "rectangle") for w in case.get("wall", ())):
         return  # which bars could cross between their nodes
     if not explicit:
         solver = case.setdefault("solver", {})

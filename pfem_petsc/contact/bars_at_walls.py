@@ -113,6 +113,7 @@ class BarsAtWalls:
     names : of these walls
     time : of positions that are tried [s]
     rubs, damped : whether one of the walls has friction, restitution below one
+    met : (walls,) bool, walls that have pushed this rank's counted bars
     force : (owned, 3) on nodes at the positions that were committed last [N]
     sums : (2, walls, 3) forces of walls on this rank's counted bars there [N], and their moments about the origin [N m]
     """
@@ -138,7 +139,7 @@ class BarsAtWalls:
         self.rubs, self.damped = bool(contact.friction[first].any()), bool((contact.restitution[first] < 1.0).any())
         self.time = 0.0
         self._before, self.force = mesh.points.copy(), np.zeros((mesh.n_owned, 3))
-        self.sums = np.zeros((2, len(contact.walls), 3))
+        self.sums, self.met = np.zeros((2, len(contact.walls), 3)), np.zeros(len(contact.walls), dtype=bool)
         self.take(np.empty((0, 2 + WIDTH)), mesh.points[: mesh.n_owned])
 
     @property
@@ -206,6 +207,7 @@ class BarsAtWalls:
         self._last_sums = sums
         if commit:
             self.force, self.sums, self._before[:], self._begun = total[: self._mesh.n_owned], sums, x, time
+            self.met |= sums[0].any(axis=1)
             self._keys, self._memory = (np.concatenate(parts) for parts in zip(*known, strict=True))
         return stored, lost
 

@@ -329,6 +329,11 @@ class History(Observer):
         touched = np.array(times["sum"]) > 0.0
         for flags in times["flags"]:
             touched |= np.array(flags, dtype=bool)
+        touch = self._model.self_contact
+        if touch is not None and touch.at_walls is not None:
+            met = touch.at_walls.met.copy()
+            self._model.comm.Allreduce(MPI.IN_PLACE, met, op=MPI.LOR)
+            touched |= met
         names = np.array(contact.names, dtype=object)[~touched]
         during = f" in stage {self._model.case.name!r}" if self._staged else ""
         # impulses are those of inertial schemes, and of several stages together

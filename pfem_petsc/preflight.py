@@ -346,7 +346,7 @@ def narrow_walls(model: Model) -> list[str]:
         members = np.zeros(mesh.n_local, dtype=bool)
         members[: mesh.n_owned] = contact.members[:, contact.first[k]]
         near = real & members[mesh.bars].any(axis=1)
-        if model.self_contact is not None and contact.walls[k].closed:  # which these bars touch between their nodes
+        if model.self_contact is not None and contact.walls[k].solid:  # which these bars touch between their nodes
             near &= ~model.self_contact.chosen
         longest = model.comm.allreduce(float(model.bars.mesh_lengths[near].max(initial=0.0)), op=MPI.MAX)
         width = contact.walls[k].width

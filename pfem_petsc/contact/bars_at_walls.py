@@ -30,9 +30,9 @@ _NEXT_TO = 1e-6  # way by which positions differ for derivatives, over the lengt
 _DEEPER = 0.25  # of the width of a wall, by which an iteration may move bars into it
 _SKIN = 0.5  # distance from a wall up to which bars are listed, over the mean length of bars
 
-SPRING, DAMPER, FORCE, MOMENT, PLACE, WIDTH = 0, 3, 6, 9, 12, 13
-"""Columns of the memory of a bar at a wall: elastic part of the slip [m]; force of the damper, and all of the force on
-the bar [N], and its moment about the origin [N m]; and where it acts, from 0 to 1 along the bar."""
+SPRING, NORMAL, FORCE, MOMENT, PLACE, DAMPER, WIDTH = 0, 3, 6, 9, 12, 13, 14
+"""Columns of the memory of a bar at a wall: elastic part of the slip [m]; normal; force on the bar [N], and its moment
+about the origin [N m]; where it acts, from 0 to 1 along the bar; and the part of the damper along the normal [N]."""
 
 
 def restitution_of(damping: float) -> float:
@@ -94,10 +94,11 @@ class BarMotion(NamedTuple):
 
 
 class Response(NamedTuple):
-    """What a wall does to bars (m,): who touches it (m,); forces on their ends (m, 2, 3) [N], energies stored, and
-    those lost in the step (m,) [J], and what they remember (m, WIDTH)."""
+    """What a wall does to bars (m,): who touches it, and who has passed through it in the step (m,); forces on their
+    ends (m, 2, 3) [N], energies stored, and those lost in the step (m,) [J], and what they remember (m, WIDTH)."""
 
     touch: np.ndarray
+    passed: np.ndarray
     force: np.ndarray
     stored: np.ndarray
     lost: np.ndarray
@@ -113,6 +114,7 @@ class BarsAtWalls:
     names : of these walls
     time : of positions that are tried [s]
     rubs, damped : whether one of the walls has friction, restitution below one
+    passed : what has passed through which of them in the last step that was tried or made, empty for nothing
     met : (walls,) bool, walls that have pushed this rank's counted bars
     force : (owned, 3) on nodes at the positions that were committed last [N]
     sums : (2, walls, 3) forces of walls on this rank's counted bars there [N], and their moments about the origin [N m]
@@ -121,7 +123,7 @@ class BarsAtWalls:
     def __init__(self, model: Any, chosen: np.ndarray) -> None:
         contact, mesh = model.contact, model.mesh
         self._model, self._contact, self._mesh = model, contact, mesh
-        self.walls = [k for k in small_walls(contact.walls) if contact.walls[k].closed]
+        self.walls = [k for k in small_walls(contact.walls) if contact.walls[k].solid]
         self.names = [contact.names[k] for k in self.walls]
         self._bars = np.flatnonzero(chosen)
         counted = np.zeros(len(mesh.bars), dtype=bool)
@@ -137,7 +139,7 @@ class BarsAtWalls:
         self._near: dict[int, tuple[np.ndarray, np.ndarray]] = {}
         first = contact.first[self.walls]
         self.rubs, self.damped = bool(contact.friction[first].any()), bool((contact.restitution[first] < 1.0).any())
-        self.time = 0.0
+        self.time, self.passed = 0.0, ""
         self._before, self.force = mesh.points.copy(), np.zeros((mesh.n_owned, 3))
         self.sums, self.met = np.zeros((2, len(contact.walls), 3)), np.zeros(len(contact.walls), dtype=bool)
         self.take(np.empty((0, 2 + WIDTH)), mesh.points[: mesh.n_owned])
@@ -191,15 +193,19 @@ class BarsAtWalls:
     def add_forces(self, x: np.ndarray, f: np.ndarray, step: float, commit: bool) -> tuple[float, float]:
         """Add the forces at positions x (local, 3) [m], a ``step`` [s] after those that were committed last, to
         internal forces ``f`` (local, 3) [N]; return the energy stored by this rank's counted bars, and that lost in the
-        step [J]."""
+        step [J]. Forces that are not a number stand for bars that have passed through a wall, see :attr:`passed`."""
         time = self._contact.state.time if commit else self.time
         total, sums, stored, lost = np.zeros((len(x), 3)), np.zeros_like(self.sums), 0.0, 0.0
         known = [(np.empty(0, dtype=np.int64), np.empty((0, WIDTH)))]
+        self.passed, names = "", self._contact.names
         for k, keys, ends, here, motion in self._touching(x, step, time):
             found = self._respond(k, here, motion)
             mine = self._counted[keys % len(self._bars)]
             stored += float(found.stored[mine].sum())
             lost += float(found.lost[mine].sum())
+            if found.passed.any():
+                bar = self._mesh.bar_ids[self._bars[keys[found.passed][0] % len(self._bars)]]
+                self.passed, found.force[found.passed] = f"bar {bar} passes through wall {names[k]!r}", np.nan
             np.add.at(total, ends, found.force)
             sums[:, k] = found.memory[mine][:, FORCE : MOMENT + 3].sum(axis=0).reshape(2, 3)
             known.append((keys[found.touch], found.memory[found.touch]))
@@ -242,7 +248,7 @@ class BarsAtWalls:
         least, limiting = 1.0, ""
         for i, k in enumerate(self.walls):
             wall = contact.walls[k]
-            room = _DEEPER * wall.width
+            room = _DEEPER * wall.depth
             most = np.linalg.norm(end - start, axis=1)[ends].max(axis=1, initial=0.0)
             fast = np.flatnonzero((most > room) & self._applies[:, i])
             if len(fast):
@@ -296,7 +302,6 @@ class BarsAtWalls:
         stiffness, push = here.stiffness, np.where(touch, -here.stiffness * gaps, 0.0)
         mobility = (weights**2 * here.inverse).sum(axis=1) + self._wall_mobility(k, point, normals)
         total = self._damped(k, here, (push, np.einsum("mi,mi->m", normals, slip), mobility), motion.step)
-        damper = (total - push)[:, None] * normals
         # friction: an elastic slip, turned into the plane across the normal, up to what Coulomb's law allows
         unit = normals / np.maximum(np.linalg.norm(normals, axis=1), 1e-300)[:, None]
         old = here.memory[:, SPRING : SPRING + 3]
@@ -308,11 +313,13 @@ class BarsAtWalls:
         end = trial * np.where(size > most, most / np.maximum(size, 1e-300), 1.0)[:, None]
         force = total[:, None] * normals - stiffness[:, None] * end
         rubbed = 0.5 * stiffness * np.einsum("mi,mi->m", flat + end, trial - end)
-        before = here.memory[:, DAMPER : DAMPER + 3]
-        lost = rubbed - 0.5 * np.einsum("mi,mi->m", before + damper, slip)
+        damper, before = total - push, here.memory[:, NORMAL : NORMAL + 3]
+        damping = damper[:, None] * normals + here.memory[:, DAMPER, None] * before
+        lost = rubbed - 0.5 * np.einsum("mi,mi->m", damping, slip)
+        passed = touch & here.touched & (np.einsum("mi,mi->m", before, normals) < 0.0)
         stored = np.where(touch, 0.5 * stiffness * (gaps**2 + np.einsum("mi,mi->m", end, end)), 0.0)
-        memory = np.column_stack([end, damper, force, np.cross(point, force), t])
-        return Response(touch, weights[:, :, None] * force[:, None, :], stored, lost, memory)
+        memory = np.column_stack([end, normals, force, np.cross(point, force), t, damper])
+        return Response(touch, passed, weights[:, :, None] * force[:, None, :], stored, lost, memory)
 
     def _wall_mobility(self, k: int, point: np.ndarray, normals: np.ndarray) -> np.ndarray | float:
         """Return the inverse masses [1/kg] with which wall k gives way at points (m, 3) along normals (m, 3)."""

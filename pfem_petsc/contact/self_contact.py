@@ -888,16 +888,16 @@ class SelfContact:
         if found is None:
             return float(self.sums[ENERGY]), self.dissipated
         arrays, state, law = found
+        unprevented = (
+            f", which the stiffness of [self_contact] did not prevent: reduce {self._steps}, or use more elements, a "
+            "larger self_contact.radius or lower velocities"
+        )
         if state is not None:
             passed = evaluate_pairs(self._pairs, state, self._memory, self._spare, arrays, law, sums)
             if self.implicit and not commit:
                 arrays.force[:] = np.nan if passed else arrays.force
             else:
-                self._report(
-                    passed,
-                    "bars {} and {} pass through each other, which the stiffness of [self_contact] did not prevent: "
-                    f"reduce {self._steps}, or use more elements, a larger self_contact.radius or lower velocities",
-                )
+                self._report(passed, f" pass through each other{unprevented}")
             add_to_nodes(self._local, self._own, arrays.force, f)
         if commit:
             self._memory, self._spare = self._spare, self._memory
@@ -907,6 +907,8 @@ class SelfContact:
         stored = float(sums[ENERGY])
         if self.at_walls is not None:
             more, lost = self.at_walls.add_forces(x, f, step, commit)
+            if not self.implicit or commit:
+                self._report(self.at_walls.passed, unprevented)
             stored += more
             self.dissipated += lost if commit else 0.0
         return stored, self.dissipated
@@ -971,8 +973,8 @@ class SelfContact:
             if not self.implicit:
                 self._report(
                     far,
-                    "bars {} and {}, which are about to touch, move by more than half the sum of their radii relative "
-                    "to each other in a step, so that contact may miss them: reduce time.step",
+                    ", which are about to touch, move by more than half the sum of their radii relative to each other "
+                    "in a step, so that contact may miss them: reduce time.step",
                 )
             self._stiffen(state, load)
         return arrays, state, law
@@ -1067,10 +1069,13 @@ class SelfContact:
         """Return whether a number is not zero on some rank. Collective."""
         return here != 0 if self.comm.size == 1 else self.comm.allreduce(here != 0, op=MPI.LOR)
 
-    def _report(self, failed: int, text: str) -> None:
-        """End the run on all ranks if on some rank a pair, counted from 1, has failed. Collective."""
-        if self._any(failed):
-            texts = self.comm.allgather(text.format(*self.ids[failed - 1].tolist()) if failed else "")
+    def _report(self, failed: int | str, text: str) -> None:
+        """End the run on all ranks if on some rank something has failed: a pair, counted from 1, or what is named, of
+        which the text tells. Collective."""
+        if self._any(bool(failed)):
+            if failed and isinstance(failed, int):
+                failed = "bars {} and {}".format(*self.ids[failed - 1].tolist())
+            texts = self.comm.allgather(f"{failed}{text}" if failed else "")
             raise SimulationFailure(min(filter(None, texts)))
 
     def _renew(self, x: np.ndarray, step: float, way: float, move: float) -> None:

@@ -6,7 +6,7 @@ from helpers.lattices import rows_of
 from helpers.stopped import assert_as_on_one_rank, assert_restart_is_bitwise
 from helpers.triangles import box, write_surface
 
-from pfem_petsc import Case
+from pfem_petsc import Case, SimulationFailure
 from pfem_petsc.contact.bars_at_walls import damping_of
 
 BALL = {"type": "sphere", "point": [0.0, 0.0, 0.0], "radius": 0.5}
@@ -90,6 +90,29 @@ def test_bar_across_the_edge_of_a_box(integrator, comm, shared_tmp_path):
     _, run = rows_of(case, comm, shared_tmp_path)
     assert comm.allreduce(float(run.state.v[:, 1].sum())) == pytest.approx(0.0, abs=1e-12)
     np.testing.assert_allclose(run.state.v[:, [0, 2]], 0.5, rtol=0.01)  # it was hit in its middle
+
+
+@pytest.mark.parametrize("integrator", ["central_differences", "generalized_alpha"])
+def test_bar_on_the_edge_of_a_sheet(integrator, comm, shared_tmp_path):
+    """A sheet with a thickness is round at its edge: the bar leaves as it came; one that is thin lets it pass."""
+    corners = [[-1.0, -1.0, 0.0], [1.0, -1.0, 0.0], [1.0, 1.0, 0.0], [-1.0, 1.0, 0.0]]
+    file = write_surface(shared_tmp_path / "sheet.obj", np.array(corners), np.array([[0, 1, 2], [0, 2, 3]]), comm)
+    wall = {"type": "surface", "file": file, "side": "both", "thickness": 0.2, "restitution": 1.0}
+    points = np.array([[0.5, 0.0, 0.5], [1.5, 0.0, -0.5]]) + 0.11 * np.array([0.5, 0.0, 0.5]) * np.sqrt(2.0)
+    case = falling(wall, points.tolist(), (-0.5, 0.0, -0.5))
+    case["time"]["integrator"] = integrator
+    _, run = rows_of(case, comm, shared_tmp_path)
+    np.testing.assert_allclose(run.state.v[:, [0, 2]], 0.5, rtol=0.01)
+    del case["wall"][0]["thickness"]
+    _, run = rows_of(case, comm, shared_tmp_path, "thin")
+    np.testing.assert_allclose(run.state.v[:, [0, 2]], -0.5, rtol=1e-12)
+
+
+def test_bar_that_is_driven_through_a_sheet_ends_the_run(comm, shared_tmp_path):
+    wall = {"type": "cylinder", "point": [0.0, 0.0, 0.0], "axis": [0.0, 1.0, 0.0], "radius": 0.02}
+    case = falling(wall, [[-1.0, 0.0, 0.03], [1.0, 0.0, 0.03]], (0.0, 0.0, -40.0), step=2e-4, end=0.01)
+    with pytest.raises(SimulationFailure, match="bar 0 passes through wall 'w', which the stiffness of"):
+        rows_of(case, comm, shared_tmp_path)
 
 
 @pytest.mark.slow

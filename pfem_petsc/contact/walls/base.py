@@ -186,17 +186,19 @@ class BaseWall(ABC):
     ----------
     flat : whether the tangent plane is the same everywhere; then ``normal`` (3,) and ``offset`` [m] are that plane
     partial : whether nodes can pass beside it, so that their previous positions matter (:meth:`stops`)
-    closed : whether bars can be deep in it, rather than cross it
+    solid : whether bars can be deep in it, and be pushed out, rather than cross it
     faces : how many planes a node can touch at once; more than one for a surface of triangles
     width : smallest extent [m] of a wall that bars can cross between their nodes, infinite for others
+    thickness : of a sheet [m], None of others
     centre : (3,) [m], the point whose position is recorded if the wall moves
     """
 
     flat = False
     partial = False
-    closed = True
+    solid = True
     faces = 1
     width = np.inf
+    thickness: float | None = None
     centre: np.ndarray
 
     @abstractmethod
@@ -219,7 +221,12 @@ class BaseWall(ABC):
 
     def crossed(self, starts: np.ndarray, ends: np.ndarray) -> np.ndarray:
         """Return (m,) bool: bars from ``starts`` to ``ends`` (m, 3) that intersect a wall of finite width."""
-        return deepest(self.gaps, np.stack([starts, ends], axis=1))[1] < -_DEEP * self.width
+        return deepest(self.gaps, np.stack([starts, ends], axis=1))[1] < -_DEEP * self.depth
+
+    @property
+    def depth(self) -> float:
+        """Extent [m] of a solid wall where bars are across it: the thickness of a sheet, else the width."""
+        return self.width if self.thickness is None else self.thickness
 
 
 def deepest(gaps_of: Callable[[np.ndarray], np.ndarray], ends: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -39,7 +39,7 @@ class Wall(Plane):
     """A part of the plane n . x = d."""
 
     partial = True
-    closed = False
+    solid = False
 
     def __init__(self, parameters: Parameters) -> None:
         super().__init__(parameters)

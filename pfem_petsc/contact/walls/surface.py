@@ -108,8 +108,10 @@ class Wall(BaseWall):
         self.note = f", {len(self.corners)} triangles, {'closed' if self.closed else 'open'}"
         self.centre = 0.5 * (self.points.min(axis=0) + self.points.max(axis=0))
         a, b, c = (self.points[self.corners[:, k]] - self.centre for k in range(3))
+        self.solid = parameters.thickness is not None if both else self.closed
         holds = self.closed and not both and np.einsum("ti,ti->", a, np.cross(b, c)) < 0.0  # nodes are inside
         self.width = np.inf if holds else extents[0 if self.closed else 1]
+        self.thickness = thickness if both else None
 
     def _tangents(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return :func:`~pfem_petsc.contact.triangles.tangent_planes` of positions (m, 3)."""
@@ -129,7 +131,7 @@ class Wall(BaseWall):
     def crossed(self, starts: np.ndarray, ends: np.ndarray) -> np.ndarray:
         """Return (m,) bool: bars from ``starts`` to ``ends`` (m, 3) that are deep in a body, or pass through another
         surface with both ends away from it."""
-        if self.closed and not self.triangles.limits[0, 0]:
+        if self.solid:
             return super().crossed(starts, ends)
         apart = np.minimum(self.gaps(starts), self.gaps(ends)) > _APART * np.linalg.norm(ends - starts, axis=1)
         n = len(starts)

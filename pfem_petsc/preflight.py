@@ -346,15 +346,18 @@ def narrow_walls(model: Model) -> list[str]:
         members = np.zeros(mesh.n_local, dtype=bool)
         members[: mesh.n_owned] = contact.members[:, contact.first[k]]
         near = real & members[mesh.bars].any(axis=1)
-        if model.self_contact is not None and contact.walls[k].solid:  # which these bars touch between their nodes
-            near &= ~model.self_contact.chosen
+        touch, other = model.self_contact, ""
+        if touch is not None and contact.walls[k].solid:  # which these bars touch between their nodes
+            near &= ~touch.chosen
+        elif touch is not None:
+            other = ", or triangles with a thickness instead, which bars that touch do not pass"
         longest = model.comm.allreduce(float(model.bars.mesh_lengths[near].max(initial=0.0)), op=MPI.MAX)
         width = contact.walls[k].width
         if width < _OPENING * longest:
             texts.append(
                 f"wall {contact.names[k]!r} is {engineering(width, 'm')} wide, and the bars of its nodes are up to "
                 f"{engineering(longest, 'm')} long: only nodes touch walls, so that it can pass between them; use a "
-                f"wall wider than {_OPENING:.2f} times the bars that it meets, or shorter bars"
+                f"wall wider than {_OPENING:.2f} times the bars that it meets, or shorter bars{other}"
             )
     return texts
 

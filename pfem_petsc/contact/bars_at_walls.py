@@ -17,7 +17,6 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from .wall_motion import Poses
-from .walls.base import deepest
 
 if TYPE_CHECKING:
     from .walls.base import BaseWall
@@ -25,7 +24,6 @@ if TYPE_CHECKING:
 _SHARE = 0.2  # of the lighter node's mass over the square of the step, and of what this leaves, that is the stiffness
 _CRITICAL = exp(-2.0)  # restitution of a damper with which nothing swings back; walls with less get it
 _BESIDE = 1e-7  # part of the length at which normals beside the place are taken
-_BISECTIONS = 24  # of the interval in which a bar is deepest
 _NEXT_TO = 1e-6  # way by which positions differ for derivatives, over the length of a bar
 _DEEPER = 0.25  # of the width of a wall, by which an iteration may move bars into it
 _SKIN = 0.5  # distance from a wall up to which bars are listed, over the mean length of bars
@@ -175,7 +173,7 @@ class BarsAtWalls:
             keys = np.union1d(near, self._keys[self._keys // max(len(self._bars), 1) == i])
             bars = keys - i * len(self._bars)
             touched = np.isin(keys, self._keys)
-            gaps = deepest(contact.walls[k].gaps, poses.rest(k, x[bars_here[bars]]))[1]
+            gaps = contact.walls[k].deepest(poses.rest(k, x[bars_here[bars]]))[1]
             found = (gaps < 0.0) | touched
             if not found.any():
                 continue
@@ -349,24 +347,11 @@ class BarsAtWalls:
 
 
 def _place(wall: BaseWall, ends: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return where bars with ends (m, 2, 3) are deepest beyond a wall at rest, from 0 to 1, the distances there (m,)
-    [m], see :func:`~pfem_petsc.contact.walls.base.deepest`, and the derivatives (m, 3) of these by the positions of the
+    """Return where bars with ends (m, 2, 3) are deepest beyond a wall at rest, and the distances there, see
+    :meth:`~pfem_petsc.contact.walls.base.BaseWall.deepest`, and the derivatives (m, 3) of these by the positions of the
     places."""
-    t, gaps = deepest(wall.gaps, ends)
-    along = ends[:, 1] - ends[:, 0]
-
-    def at(t: np.ndarray) -> np.ndarray:
-        return ends[:, 0] + t[:, None] * along
-
-    # where the distance begins to grow along the bar, to rounding
-    low, high = np.maximum(t - 2.0 * _BESIDE, 0.0), np.minimum(t + 2.0 * _BESIDE, 1.0)
-    for _ in range(_BISECTIONS):
-        middle = 0.5 * (low + high)
-        falls = np.einsum("mi,mi->m", wall.planes(at(middle))[0], along) < 0.0
-        low, high = np.where(falls, middle, low), np.where(falls, high, middle)
-    t = 0.5 * (low + high)
-    gaps = np.where(np.isfinite(gaps), wall.gaps(at(t)), gaps)
-    behind, ahead = (wall.planes(at(t + side * _BESIDE))[0] for side in (-1.0, 1.0))
+    (t, gaps), along = wall.deepest(ends), ends[:, 1] - ends[:, 0]
+    behind, ahead = (wall.planes(ends[:, 0] + (t + side * _BESIDE)[:, None] * along)[0] for side in (-1.0, 1.0))
     falls, rises = (np.einsum("mi,mi->m", normal, along) for normal in (behind, ahead))
     share = np.where(rises > falls, np.clip(rises / np.where(rises > falls, rises - falls, 1.0), 0.0, 1.0), 0.5)
     mean = share[:, None] * behind + (1.0 - share)[:, None] * ahead

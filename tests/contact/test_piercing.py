@@ -5,7 +5,6 @@ import pytest
 
 from pfem_petsc import Case, Simulation
 from pfem_petsc.contact.walls import cylinder, sphere
-from pfem_petsc.contact.walls.base import deepest
 from pfem_petsc.preflight import warnings_before
 
 SHAPES = {
@@ -90,7 +89,7 @@ def test_deepest_places_against_sampling(kind):
     part = np.linspace(0.0, 1.0, 4001)[:, None, None]
     gaps = wall.gaps((ends[:, 0] + part * (ends[:, 1] - ends[:, 0])).reshape(-1, 3)).reshape(len(part), -1)
     within = (gaps.argmin(axis=0) % 4000 > 0) & (gaps.min(axis=0) < 0.0)
-    where, least = deepest(wall.gaps, ends)
+    where, least = wall.deepest(ends)
     assert 5 < within.sum() < 50 and np.isinf(least[gaps.argmin(axis=0) % 4000 == 0]).all()
     np.testing.assert_allclose(least[within], gaps.min(axis=0)[within], atol=1e-5)
     np.testing.assert_allclose(where[within], part[gaps.argmin(axis=0)[within], 0, 0], atol=2e-3)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Annotated, Any, Literal
 
@@ -35,9 +34,8 @@ _DEEP = 0.125
 """Depth of bars in a body, as a fraction of its width, beyond which they are reported."""
 _SAMPLES = 9
 """Places along a bar at which the least distance is looked for first."""
-_GOLDEN = 0.5 * (np.sqrt(5.0) - 1.0)
-_ROUNDS = 30
-"""Of the search by golden sections, each of which leaves 0.62 of the interval."""
+_BISECTIONS = 45
+"""Of what is left between two of them, to rounding."""
 _AT_END = 1e-7
 """Part of the length next to an end of a bar, where walls stop the node."""
 
@@ -221,46 +219,32 @@ class BaseWall(ABC):
 
     def crossed(self, starts: np.ndarray, ends: np.ndarray) -> np.ndarray:
         """Return (m,) bool: bars from ``starts`` to ``ends`` (m, 3) that intersect a wall of finite width."""
-        return deepest(self.gaps, np.stack([starts, ends], axis=1))[1] < -_DEEP * self.depth
+        return self.deepest(np.stack([starts, ends], axis=1))[1] < -_DEEP * self.depth
+
+    def deepest(self, ends: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return where between their ends (m, 2, 3) bars are deepest beyond the wall, from 0 to 1, and the distances
+        there (m,) [m]; infinite where that is at an end, which walls stop as a node, and of bars that are far from it.
+        """
+        where, least, along = np.zeros(len(ends)), np.full(len(ends), np.inf), ends[:, 1] - ends[:, 0]
+        # the distance changes along a bar by no more than the way
+        near = np.flatnonzero(self.gaps(ends.mean(axis=1)) <= 0.5 * np.linalg.norm(along, axis=1))
+        if not len(near):
+            return where, least
+        start, along, places = ends[near, 0], along[near], np.linspace(0.0, 1.0, _SAMPLES)
+        best = np.stack([self.gaps(start + t * along) for t in places]).argmin(axis=0)
+        low, high = places[np.maximum(best - 1, 0)], places[np.minimum(best + 1, _SAMPLES - 1)]
+        for _ in range(_BISECTIONS):  # for where the distance begins to grow along the bar
+            t = 0.5 * (low + high)
+            falls = np.einsum("mi,mi->m", self.planes(start + t[:, None] * along)[0], along) < 0.0
+            low, high = np.where(falls, t, low), np.where(falls, high, t)
+        between, gaps = (t > _AT_END) & (t < 1.0 - _AT_END), self.gaps(start + t[:, None] * along)
+        where[near], least[near] = t, np.where(between, gaps, np.inf)
+        return where, least
 
     @property
     def depth(self) -> float:
         """Extent [m] of a solid wall where bars are across it: the thickness of a sheet, else the width."""
         return self.width if self.thickness is None else self.thickness
-
-
-def deepest(gaps_of: Callable[[np.ndarray], np.ndarray], ends: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return where between their ends (m, 2, 3) bars are deepest beyond a wall, from 0 to 1, and the distances there
-    (m,) [m]; infinite where that is at an end, which walls stop as a node, and of bars that are far from it.
-
-    ``gaps_of``: see :meth:`BaseWall.gaps`
-    """
-
-    def gap(t: np.ndarray) -> np.ndarray:
-        return gaps_of((1.0 - t)[:, None] * ends[:, 0] + t[:, None] * ends[:, 1])
-
-    where, least = np.zeros(len(ends)), np.full(len(ends), np.inf)
-    # the distance changes along a bar by no more than the way
-    near = np.flatnonzero(gap(where + 0.5) <= 0.5 * np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1))
-    if not len(near):
-        return where, least
-    ends, places = ends[near], np.linspace(0.0, 1.0, _SAMPLES)
-    best = np.stack([gap(np.full(len(ends), t)) for t in places]).argmin(axis=0)
-    low, high = places[np.maximum(best - 1, 0)], places[np.minimum(best + 1, _SAMPLES - 1)]
-    one, two = high - _GOLDEN * (high - low), low + _GOLDEN * (high - low)
-    first, second = gap(one), gap(two)
-    for _ in range(_ROUNDS):
-        left = first < second
-        low, high = np.where(left, low, one), np.where(left, two, high)
-        one, two = (
-            np.where(left, high - _GOLDEN * (high - low), two),
-            np.where(left, one, low + _GOLDEN * (high - low)),
-        )
-        fresh = gap(np.where(left, one, two))
-        first, second = np.where(left, fresh, second), np.where(left, first, fresh)
-    t = 0.5 * (low + high)
-    where[near], least[near] = t, np.where((t > _AT_END) & (t < 1.0 - _AT_END), gap(t), np.inf)
-    return where, least
 
 
 class RoundWall(BaseWall):

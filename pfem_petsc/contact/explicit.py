@@ -17,8 +17,8 @@ from ..tolerances import FIXED_POINT, PROJECTED, RANK
 from .friction import jam
 from .node_walls import TURN, NodeWalls, WallForces
 from .projection import INFEASIBLE, JAMMED, NodesAtPlanes, Planes, new_pressed, press
-from .rotations import across
-from .surfaces import OTHER, Surfaces, is_round, tangent
+from .rotations import NOWHERE, across, add_to, along, cross, dot, minus, put, vector
+from .surfaces import OTHER, Surfaces, beyond, is_round, tangent
 from .tied import Ties
 
 if TYPE_CHECKING:
@@ -164,7 +164,7 @@ def _list_penetrating(free, first, last, walls, returning, m):
         for k in range(len(radii)):
             gap = 0.0
             if radii[k] != OTHER:
-                _, _, _, gap = tangent(k, surfaces, free[0, i], free[1, i], free[2, i])
+                _, gap = tangent(k, surfaces, (free[0, i], free[1, i], free[2, i]))
             if (gap < 0.0 and (all_nodes[k] or members[i, k])) or (returning and walls.rebound[i, k] > 0.0):
                 walls.room[m] = i
                 m += 1
@@ -217,42 +217,35 @@ def rebound_lift(restitution: Any, square: Any, arrival: Any, pull: Any) -> Any:
 def _acting(j, k, normal, walls, given):
     """Return the direction in which a round wall pushes the j-th node, see
     :meth:`~pfem_petsc.contact.node_walls.NodeWalls.acting`; ``normal`` is the one where it ends."""
-    surfaces, part, start, ways, free = walls.surfaces, walls.part, given.start, given.ways, given.free
-    bx, by, bz = start[j, 0] + ways[j, k, 0], start[j, 1] + ways[j, k, 1], start[j, 2] + ways[j, k, 2]
-    there = bx + part * (free[j, 0] - bx), by + part * (free[j, 1] - by), bz + part * (free[j, 2] - bz)
-    nx, ny, nz, _ = tangent(k, surfaces, there[0], there[1], there[2])
-    ex, ey, ez, _ = tangent(k, surfaces, free[j, 0], free[j, 1], free[j, 2])
-    return (nx, ny, nz) if part < 1.0 and nx * ex + ny * ey + nz * ez > TURN else normal
+    end, start = vector(given.free, j), along(vector(given.start, j), 1.0, vector(given.ways[j], k))
+    there, _ = tangent(k, walls.surfaces, along(start, walls.part, minus(end, start)))
+    ending, _ = tangent(k, walls.surfaces, end)
+    return there if walls.part < 1.0 and dot(there, ending) > TURN else normal
 
 
 @inlined
 def _set_planes(j, at, pushed, walls, given, planes, pulls):
     """Set the planes of the j-th node at positions ``at`` (m, 3), and the ``pulls`` (m, w) of forces towards walls with
     restitution [m], by which it would move to ``pushed`` (m, 3) without walls."""
-    surfaces, restitution, start, free = walls.surfaces, walls.restitution, given.start, given.free
-    x, y, z = at[j, 0], at[j, 1], at[j, 2]
+    surfaces, restitution, place = walls.surfaces, walls.restitution, vector(at, j)
+    start, free = vector(given.start, j), vector(given.free, j)
     for k in range(planes.gaps.shape[1]):
         if surfaces.radii[k] == OTHER:
-            n, gap = (given.normals[j, k, 0], given.normals[j, k, 1], given.normals[j, k, 2]), -given.offsets[j, k]
-            gap += n[0] * x + n[1] * y + n[2] * z
+            normal = vector(given.normals[j], k)
+            gap = beyond(normal, given.offsets[j, k], place)
         else:
-            nx, ny, nz, gap = tangent(k, surfaces, x, y, z)
-            n = (nx, ny, nz)
+            normal, gap = tangent(k, surfaces, place)
             if surfaces.radii[k] != 0.0:
-                n = _acting(j, k, n, walls, given)
-        gap += n[0] * (free[j, 0] - x) + n[1] * (free[j, 1] - y) + n[2] * (free[j, 2] - z)
-        planes.normals[j, k, 0], planes.normals[j, k, 1], planes.normals[j, k, 2] = n
+                normal = _acting(j, k, normal, walls, given)
+        gap += dot(normal, minus(free, place))
+        put(planes.normals[j], k, normal)
         if len(restitution) > 0:
-            pull = 0.0
-            for c in range(3):
-                pull -= planes.normals[j, k, c] * (pushed[j, c] - start[j, c] - given.drift[j, c])
-            pulls[j, k] = pull
-            gap -= rebound_lift(restitution[k], given.rebound[j, k], given.arrival[j, k], pull)
+            pulls[j, k] = -dot(normal, minus(minus(vector(pushed, j), start), vector(given.drift, j)))
+            gap -= rebound_lift(restitution[k], given.rebound[j, k], given.arrival[j, k], pulls[j, k])
         planes.gaps[j, k] = gap if given.applies[j, k] else math.inf
         if len(planes.friction) > 0:
             planes.friction[j, k, 0], planes.friction[j, k, 1] = walls.friction[0, k], walls.friction[1, k]
-            for c in range(3):
-                planes.slips[j, k, c] = free[j, c] - start[j, c] - given.ways[j, k, c]
+            put(planes.slips[j], k, minus(minus(free, start), vector(given.ways[j], k)))
 
 
 @inlined
@@ -261,7 +254,7 @@ def _meets_round(j, found, walls, given):
     surfaces, bounces = walls.surfaces, len(walls.restitution) > 0
     for k in range(found.normal.shape[1]):
         if is_round(surfaces.radii[k]) and given.applies[j, k]:
-            _, _, _, gap = tangent(k, surfaces, found.x[j, 0], found.x[j, 1], found.x[j, 2])
+            _, gap = tangent(k, surfaces, vector(found.x, j))
             if found.normal[j, k] > 0.0 or gap < 0.0 or (bounces and given.rebound[j, k] > 0.0):
                 return True
     return False
@@ -269,30 +262,25 @@ def _meets_round(j, found, walls, given):
 
 @inlined
 def _settle(j, at, nodes, found, walls, given, pulls):
-    """Press the j-th of :class:`NodesAtPlanes` again, whose planes were those at ``at`` (3,), until planes of round
-    walls and position agree. Returns why it has no place, or 0.
+    """Press the j-th of :class:`NodesAtPlanes` again, whose planes were those at ``at`` (m, 3), until planes
+    of round walls and position agree. Returns why it has no place, or 0.
 
     With friction, the positions of planes are those of Aitken's relaxation: in large steps, those of friction alone
     alternate or creep.
     """
-    x, last, part, rubs = found.x[j], np.zeros(3), 1.0, len(nodes.planes.friction) > 0
+    last, part, rubs = NOWHERE, 1.0, len(nodes.planes.friction) > 0
     for _ in range(_CURVED_ROUNDS):
         if not _meets_round(j, found, walls, given):
             return 0
-        along = square = largest = 0.0
-        for c in range(3):
-            change = x[c] - at[c] - last[c]
-            along -= last[c] * change
-            square += change * change
-            last[c] += change
-            largest = max(largest, abs(last[c]))
-        if largest <= walls.tolerance:
+        before, last = last, minus(vector(found.x, j), vector(at, j))
+        if max(abs(last[0]), abs(last[1]), abs(last[2])) <= walls.tolerance:
             return 0
-        if rubs and along != 0.0:
-            part = min(max(part * along / square, _LEAST_PART), _LARGEST_PART) if along > 0.0 else 0.5
-        for c in range(3):
-            at[c] += part * last[c]
-            x[c] = at[c]
+        change = minus(last, before)
+        less = -dot(before, change)
+        if rubs and less != 0.0:
+            part = min(max(part * less / dot(change, change), _LEAST_PART), _LARGEST_PART) if less > 0.0 else 0.5
+        add_to(at, j, part, last)
+        put(found.x, j, vector(at, j))
         _set_planes(j, found.x, given.free, walls, given, nodes.planes, pulls)
         _, why = press((j, j + 1), nodes, walls.tolerance, found, NEEDED)
         if why > 0:
@@ -308,7 +296,7 @@ def _press_all(nodes, found, walls, given, pulls, curved, several):
     failed, why = press((0, len(at)), nodes, walls.tolerance, found, several)
     if curved is not None:
         for j in range(len(at)):
-            wrong = why if j == failed else _settle(j, at[j], nodes, found, walls, given, pulls)
+            wrong = why if j == failed else _settle(j, at, nodes, found, walls, given, pulls)
             if wrong > 0 and (failed < 0 or j < failed):
                 failed, why = j, wrong
     return failed, why
@@ -320,11 +308,9 @@ def _remember(found, planes, pulls, walls, given):
     for j in range(len(found.x)):
         for k in range(len(walls.restitution)):
             fresh = found.normal[j, k] > 0.0 and not given.touching[j, k] and walls.restitution[k] > 0.0
-            approach = arrived = 0.0
-            for c in range(3):
-                way = given.start[j, c] + given.ways[j, k, c]
-                approach -= planes.normals[j, k, c] * (given.free[j, c] - way + walls.pushed[k, c])
-                arrived -= planes.normals[j, k, c] * (found.x[j, c] - way)
+            normal, start = vector(planes.normals[j], k), along(vector(given.start, j), 1.0, vector(given.ways[j], k))
+            approach = -dot(normal, along(minus(vector(given.free, j), start), 1.0, vector(walls.pushed, k)))
+            arrived = -dot(normal, minus(vector(found.x, j), start))
             given.rebound[j, k] = impact_square(approach, arrived, pulls[j, k]) if fresh else 0.0
             given.arrival[j, k] = arrived if fresh else 0.0
 
@@ -374,29 +360,25 @@ def press_nodes(given, walls, sums, curved, rough, several):
     if rough is not None:  # noqa: SIM102 - what is not needed is not compiled
         if failed < 0:
             failed, why = _press_all(NodesAtPlanes(*of_nodes, planes), found, walls, given, pulls, curved, several)
-    total, touching, arm, dissipated = np.zeros((m, 3)), np.zeros((m, w), dtype=np.bool_), np.empty(3), 0.0
-    drag = found.drag
+    total, touching, dissipated = np.zeros((m, 3)), np.zeros((m, w), dtype=np.bool_), 0.0
     for j in range(m):
-        for c in range(3):  # where the forces of the balance act
-            arm[c] = start[j, c] + walls.part * (found.x[j, c] - start[j, c])
+        way = minus(vector(found.x, j), vector(start, j))
+        acts = along(vector(start, j), walls.part, way)  # where the forces of the balance do
         for k in range(w):
-            strength, wall = found.normal[j, k], wall_of[k]
-            if strength == 0.0:
+            if found.normal[j, k] == 0.0:
                 continue
-            touching[j, k] = True
+            touching[j, k], wall = True, wall_of[k]
             sums.contacts[wall] += 1
             for earlier in range(k):  # a node in several slots of a wall counts once
                 if wall_of[earlier] == wall and touching[j, earlier]:
                     sums.contacts[wall] -= 1
                     break
-            for c in range(3):
-                force = strength * normals[j, k, c] + drag[j, k, c]
-                dissipated -= drag[j, k, c] * (found.x[j, c] - start[j, c] - ways[j, k, c])
-                total[j, c] += force
-                sums.force[wall, c] += force
-                one, other = (c + 1) % 3, (c + 2) % 3
-                sums.moment[wall, one] += arm[other] * force
-                sums.moment[wall, other] -= arm[one] * force
+            drag = vector(found.drag[j], k)
+            dissipated -= dot(drag, minus(way, vector(ways[j], k)))
+            force = along(drag, found.normal[j, k], vector(normals[j], k))
+            add_to(total, j, 1.0, force)
+            add_to(sums.force, wall, 1.0, force)
+            add_to(sums.moment, wall, 1.0, cross(acts, force))
     return failed, why, found, total, touching, dissipated
 
 

@@ -10,6 +10,9 @@ import numpy as np
 
 from ..mechanics.compiled import inlined, kernel
 
+NOWHERE = 0.0, 0.0, 0.0
+"""The vector of no length."""
+
 _ROUNDS = 50  # of Newton's method, which needs five
 _NEAR = 1e-9  # last move [rad], the square of which is below rounding
 _SMALL = 1e-2  # angle [rad] below which differences of nearly equal numbers are a series

@@ -20,7 +20,7 @@ from .explicit import Arrivals, impact_square, planes_of, rebound_lift
 from .fixed_rows import TwoNodeRows
 from .friction import FAST, planes_at_rest, sliding
 from .projection import Planes
-from .rows import FreeNodes, RowSet, WallsOfNodes, free_positions, last_forces, push_nodes
+from .rows import FreeNodes, RowSet, WallsOfNodes, free_positions, push_nodes
 
 if TYPE_CHECKING:
     from ..case.schema import Case
@@ -262,7 +262,7 @@ class ConstraintSet:
     def _of_counted(self) -> dict[str, np.ndarray]:
         """Return what is kept of the rows that this rank counts."""
         closed = np.zeros(len(self.force), dtype=np.uint8)
-        closed[self.two.at] = self.two.record.closed
+        closed[self.two.at] = self.two.closed
         counted = self.rows.counted
         kept = {
             "rows.force": self.force,
@@ -279,7 +279,7 @@ class ConstraintSet:
         values = (self.rows.of_counted(values, rows) for values in counted.values())
         self.force, jacobian, closed, self.drag, self.rebound, self.arrival = values
         self.jacobian = np.where(self.rows.fixed[:, None, None], self.rows.fixed_jacobian, jacobian)
-        self.two.record.closed[:] = closed[self.two.at] > 0
+        self.two.closed[:] = closed[self.two.at] > 0
 
     def explicit(self, balance: Balance, state: State, u: np.ndarray, stiffness: np.ndarray) -> np.ndarray | None:
         """Return the forces (n, 3) [N] on the nodes of rows in a step in which each node is solved on its own, with
@@ -320,15 +320,14 @@ class ConstraintSet:
         moved = rows.along(rows.fixed_jacobian, x - start) if self.rebounds else np.empty(0)
         pull = rows.along(rows.fixed_jacobian, drift) - moved if self.rebounds else moved
         lift, before = self._lift(pull), self.force > 0.0
-        pushes, self.jacobian, system = rows.project(nodes, self.contact.tolerance, stopping, lift)
-        self.force, self.drag, self.friction = pushes.force, pushes.drag, 0.0
+        pushes, self.jacobian = rows.project(nodes, self.contact.tolerance, stopping, lift)
+        self.force, self.drag, self.friction = pushes.normal, pushes.drag, 0.0
         if self.rebounds:
             fresh, arrived = (self.force > 0.0) & ~before & (rows.restitution > 0.0), rows.values(start)
             self.rebound = np.where(fresh, impact_square(-moved, arrived, pull), 0.0)
             self.arrival = np.where(fresh, arrived, 0.0)
         if rows.rubs:
-            slips = system.slips + rows.slips(pushes.moves)
-            self.friction = -float((self.drag * slips)[rows.counted].sum())
+            self.friction = -float((self.drag * rows.slips(x - start + pushes.moves))[rows.counted].sum())
         if not self.force.any():
             return None
         load = rows.forces(self.jacobian, self.force, self.drag)
@@ -387,7 +386,10 @@ class ConstraintSet:
         rows, totals = self.rows, np.zeros((len(self.names), 3))
         if not self:
             return totals
-        last_forces(rows.counted, rows.source, rows.last, rows.loads(self.jacobian, self.force, self.drag), totals)
+        at = np.flatnonzero(rows.counted & (self.force != 0.0))
+        last, force = rows.last[at], self.force[at, None]
+        push = force * self.jacobian[at, last] + rows.weights[at, last][:, None] * self.drag[at]
+        np.add.at(totals, rows.source[at], push)
         return totals
 
     def tables(self, owned: int) -> np.ndarray:
@@ -544,14 +546,15 @@ class ConstraintSet:
         nodes = FreeNodes(every, hard, np.zeros_like(every), at_start=False, free=rows.free)
         with agreed(self.mesh.comm):
             planes = planes_at_rest(contact, rests, (x, v, every), still)
-            system = rows.system(self.jacobian, values, nodes, (place, planes))
+            system = rows.system(self.jacobian, values, nodes, place, planes)
             if rows.rubs:
                 squares = np.maximum((rows.weights**2).sum(axis=1, keepdims=True), 1e-300)
                 along = np.einsum("rk,rki->ri", rows.weights, self.jacobian) / squares
                 fast = FAST * largest / max(np.abs(v).max(initial=0.0), still)
-                system = system._replace(slips=system.slips + fast * sliding(rows.slips(v), along, still))
+                slips = system.rows.slips
+                slips += fast * sliding(rows.slips(v), along, still)
             pushes = rows.solve(system, 1e-13 * largest, largest)
-        self.force, self.drag = pushes.force, pushes.drag
+        self.force, self.drag = pushes.normal, pushes.drag
         change[rows.here] = (rows.forces(self.jacobian, self.force, self.drag) * rows.free)[rows.mine]
         return change
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from ..mechanics.compiled import NEEDED, inlined, kernel
 from ..tolerances import FREE_PART, SINGULAR_ROW
-from .rotations import NOWHERE, add_to, dot, free_components, minus, put, times, vector
+from .rotations import NOWHERE, add_to, dot, free_components, minus, put, vector
 from .sweeps import Pushes, RubbingRows, compliance, displace, settle_friction
 
 
@@ -317,56 +317,38 @@ class Groups(NamedTuple):
 
 
 class System(NamedTuple):
-    """Rows and their nodes at free positions.
+    """Rows and their nodes at free positions, as they are solved in groups.
 
     Attributes
     ----------
-    ends, gradients : (r, k), (r, k, 3) nodes of each row, -1 for none, and its gradient there
-    values : (r,) rows [m], infinite for rows that do not apply
-    weights, friction, slips : (r, k), (r, 2), (r, 3) of rows, see :class:`~pfem_petsc.contact.sweeps.RubbingRows`
-    stiffness, free : (n,), (n, 3) of nodes: force for a displacement [N/m]; 0.0 where supports prescribe a component
+    rows : RubbingRows, with values that are infinite for rows that do not apply; their normals, and room, are empty
     plane : (n,) index of each node among those at walls (m,), -1 for none; planes : Planes of walls at these
     """
 
-    ends: np.ndarray
-    gradients: np.ndarray
-    values: np.ndarray
-    weights: np.ndarray
-    friction: np.ndarray
-    slips: np.ndarray
-    stiffness: np.ndarray
-    free: np.ndarray
+    rows: RubbingRows
     plane: np.ndarray
     planes: Planes
-
-
-class RowPushes(NamedTuple):
-    """Results for rows (r,) and nodes (n,): normal ``force`` (r,) and ``drag`` (r, 3) [N], displacements (n, 3) [m]."""
-
-    force: np.ndarray
-    drag: np.ndarray
-    moves: np.ndarray
 
 
 @inlined
 def _add_rows(group, groups, system, room):
     """Begin the room with those rows of a group that can press; return how many there are."""
-    ends, gradients, values, weights, friction, slips, _, free, _, _ = system
-    rows, n = room.rows, 0
+    every, rows, n = system.rows, room.rows, 0
     for q in range(groups.starts[group], groups.starts[group + 1]):
         r, square = groups.rows[q], 0.0
-        for k in range(ends.shape[1]):
-            i = ends[r, k]
-            rows.ends[n, k], rows.weights[n, k] = i, weights[r, k]
+        for k in range(every.ends.shape[1]):
+            i = every.ends[r, k]
+            rows.ends[n, k], rows.weights[n, k] = i, every.weights[r, k]
             for c in range(3):
-                rows.gradients[n, k, c] = gradients[r, k, c] * free[i, c] if i >= 0 else 0.0
+                gradient = every.gradients[r, k, c]
+                rows.gradients[n, k, c] = gradient if i >= 0 and every.soft[i, c] > 0.0 else 0.0
                 square += rows.gradients[n, k, c] * rows.gradients[n, k, c]
-                if weights[r, k] != 0.0:
-                    rows.normals[n, c] = gradients[r, k, c] / weights[r, k]
-        if square > FREE_PART and values[r] != math.inf:
-            rows.values[n], room.slot[n] = values[r], r
-            rows.friction[n, 0], rows.friction[n, 1] = friction[r, 0], friction[r, 1]
-            put(rows.slips, n, vector(slips, r))
+                if every.weights[r, k] != 0.0:
+                    rows.normals[n, c] = gradient / every.weights[r, k]
+        if square > FREE_PART and every.values[r] != math.inf:
+            rows.values[n], room.slot[n] = every.values[r], r
+            rows.friction[n, 0], rows.friction[n, 1] = every.friction[r, 0], every.friction[r, 1]
+            put(rows.slips, n, vector(every.slips, r))
             n += 1
     return n
 
@@ -381,7 +363,7 @@ def project_groups(which, groups, system, tolerances, size, pushes):
     system : System
     tolerances : (groups,) a row violated by at most this counts as satisfied [m]
     size : largest coordinate [m]
-    pushes : RowPushes, output; written for these groups only
+    pushes : Pushes, output; written for these groups only
 
     Returns
     -------
@@ -392,15 +374,13 @@ def project_groups(which, groups, system, tolerances, size, pushes):
     for g in which:
         at_walls = walls * (groups.node_starts[g + 1] - groups.node_starts[g])
         most = max(most, groups.starts[g + 1] - groups.starts[g] + at_walls)
-    room = new_room(most, system.ends.shape[1], np.empty(system.free.shape), pushes.moves)
+    room = new_room(most, system.rows.ends.shape[1], system.rows.soft, pushes.moves)
     for g in which:
         for q in range(groups.starts[g], groups.starts[g + 1]):
-            pushes.force[groups.rows[q]] = 0.0
+            pushes.normal[groups.rows[q]] = 0.0
             put(pushes.drag, groups.rows[q], NOWHERE)
         for q in range(groups.node_starts[g], groups.node_starts[g + 1]):
-            i = groups.nodes[q]
-            put(room.rows.soft, i, times(1.0 / system.stiffness[i], vector(system.free, i)))
-            put(pushes.moves, i, NOWHERE)
+            put(pushes.moves, groups.nodes[q], NOWHERE)
         count = n = _add_rows(g, groups, system, room)
         for q in range(groups.node_starts[g], groups.node_starts[g + 1] if walls > 0 else 0):
             i = groups.nodes[q]
@@ -410,6 +390,6 @@ def project_groups(which, groups, system, tolerances, size, pushes):
         if why != 0:
             return g, why
         for a in range(count):
-            pushes.force[room.slot[a]] = room.pushes.normal[a]
+            pushes.normal[room.slot[a]] = room.pushes.normal[a]
             put(pushes.drag, room.slot[a], vector(room.pushes.drag, a))
     return -1, 0

@@ -55,7 +55,8 @@ class RubbingRows(NamedTuple):
 
 
 class Pushes(NamedTuple):
-    """Normal forces of rows (r,) and drags (r, 3) [N], and the displacements (n, 3) of the nodes by these [m]."""
+    """``normal`` forces of rows (r,) and ``drag`` (r, 3) [N], and the displacements ``moves`` (n, 3) of nodes by these
+    [m]."""
 
     normal: np.ndarray
     drag: np.ndarray

@@ -150,8 +150,8 @@ class RowCoordinates:
         tolerance = PROJECTED * self.constraints.contact.size
         nodes = FreeNodes(x, k, self._start, self._part == 0.0, rows.free, rub=False)
         with agreed(self.comm):
-            pushes, jacobian, _ = rows.project(nodes, tolerance)
-        u[here] += (rows.forces(jacobian, pushes.force) * rows.free / k[:, None])[rows.mine]
+            pushes, jacobian = rows.project(nodes, tolerance)
+        u[here] += (rows.forces(jacobian, pushes.normal) * rows.free / k[:, None])[rows.mine]
 
     def _all(self, array: np.ndarray) -> np.ndarray:
         """Return the unknowns (3 n,) of all nodes from an array whose first rows are owned nodes. Collective."""

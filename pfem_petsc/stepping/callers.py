@@ -112,7 +112,7 @@ class RowCaller(Caller):
         """Count the rows without which the loop cannot go on alone: with forces, closed, or about to rebound."""
         links = self.links
         closed = (links.force > 0.0) | (links.rebound > 0.0)
-        closed[links.two.at] |= links.two.record.closed
+        closed[links.two.at] |= links.two.closed
         self.record.counts[CLOSED] = np.count_nonzero(closed)
 
     def _make(self, step: int, what: int) -> None:
@@ -141,7 +141,7 @@ class RowCaller(Caller):
         self._keep(HELD, links.pressed())
         self._count_closed()
         two = links.two
-        changed = (links.force[two.at] > 0.0) != two.record.closed
+        changed = (links.force[two.at] > 0.0) != two.closed
         if changed.any():
             nodes = two.nodes[:, changed]
             self._keep(CHANGING, np.unique(nodes[nodes >= 0]))

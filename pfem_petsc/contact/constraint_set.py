@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import compress
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -336,23 +337,20 @@ class ConstraintSet:
     def _starts(self, balance: Balance, state: State) -> tuple[np.ndarray | None, ...]:
         """Return positions at the start of a step and displacements without forces (n, 3) [m], tied nodes and where to
         (n, 4), and the memory of walls (2, n, w); nothing of what no row or wall needs. Collective."""
-        walls, parts = self._walls, []
+        walls = self._walls
         rebounds, at_start = self.rebounds or walls.rebounds, balance.acting < 1.0
         starts = rebounds or self.rows.rubs or walls.rubs or (at_start and (self._turning or walls.curved))
-        if starts:
-            parts.append(lambda at: state.position[at])
-        if rebounds:
-            parts.append(lambda at: balance.predictor[at] - state.position[at])
-        if walls.ties:
-            parts.append(lambda at: walls.held(at, balance.time))
-        if walls.rebounds:
-            parts.append(walls.memory)
-        none = np.empty((2, len(self._x), 0))
-        if not parts:
+        none, needed = np.empty((2, len(self._x), 0)), (starts, rebounds, walls.ties, walls.rebounds)
+        if not any(needed):
             return None, none[0], none[0], none
-        table = self.rows.collect(lambda at: np.column_stack([part(at) for part in parts]))
-        widths = np.cumsum([3 * starts, 3 * rebounds, 4 * walls.ties])
-        start, drift, held, memory = np.split(table, widths, axis=1)
+        parts = (
+            lambda at: state.position[at],
+            lambda at: balance.predictor[at] - state.position[at],
+            lambda at: walls.held(at, balance.time),
+            walls.memory,
+        )
+        table = self.rows.collect(lambda at: np.column_stack([part(at) for part in compress(parts, needed)]))
+        start, drift, held, memory = np.split(table, np.cumsum([3 * starts, 3 * rebounds, 4 * walls.ties]), axis=1)
         memory = np.stack(np.split(memory, 2, axis=1)) if walls.rebounds else none
         return start if starts else None, drift, held, memory
 

@@ -129,42 +129,30 @@ def find_penetrating(free, walls, marked):
 @inlined
 def _any_beyond(xs, ys, zs, first, last, surfaces):
     """Return whether any of consecutive nodes is beyond a wall, to whichever nodes it applies."""
-    normals, offsets, radii = surfaces.normals, surfaces.offsets, surfaces.radii
-    centres, axes = surfaces.centres, surfaces.axes
-    beyond = 0
-    for k in range(len(radii)):  # without branches
-        if radii[k] == 0.0:
-            nx, ny, nz, offset = normals[k, 0], normals[k, 1], normals[k, 2], offsets[k]
+    found = 0
+    for k in range(len(surfaces.radii)):  # over nodes without branches and roots
+        normal, offset, radius = vector(surfaces.normals, k), surfaces.offsets[k], surfaces.radii[k]
+        if radius == 0.0:
             for i in range(first, last):
-                gap = -offset + nx * xs[i] + ny * ys[i] + nz * zs[i]
-                beyond += 1 if gap < 0.0 else 0
-            continue
-        if not is_round(radii[k]):
-            continue
-        # without roots
-        cx, cy, cz, ax, ay, az = centres[k, 0], centres[k, 1], centres[k, 2], axes[k, 0], axes[k, 1], axes[k, 2]
-        side = 1.0 if radii[k] > 0.0 else -1.0
-        limit = radii[k] * radii[k] * (1.0 + side * _ROOT)
-        for i in range(first, last):
-            x, y, z = xs[i] - cx, ys[i] - cy, zs[i] - cz
-            along = x * ax + y * ay + z * az
-            x -= along * ax
-            y -= along * ay
-            z -= along * az
-            beyond += 1 if side * (x * x + y * y + z * z - limit) < 0.0 else 0
-    return beyond > 0
+                found += 1 if beyond(normal, offset, (xs[i], ys[i], zs[i])) < 0.0 else 0
+        elif is_round(radius):
+            centre, axis, side = vector(surfaces.centres, k), vector(surfaces.axes, k), 1.0 if radius > 0.0 else -1.0
+            limit = radius * radius * (1.0 + side * _ROOT)
+            for i in range(first, last):
+                arm = minus((xs[i], ys[i], zs[i]), centre)
+                arm = along(arm, -dot(arm, axis), axis)
+                found += 1 if side * (dot(arm, arm) - limit) < 0.0 else 0
+    return found > 0
 
 
 @inlined
 def _list_penetrating(free, first, last, walls, returning, m):
     """Append those of consecutive nodes that are beyond a wall that applies to them, or rebound, to the ``m`` found."""
     surfaces, all_nodes, members = walls.surfaces, walls.all_nodes, walls.members
-    radii = surfaces.radii
     for i in range(first, last):
-        for k in range(len(radii)):
-            gap = 0.0
-            if radii[k] != OTHER:
-                _, gap = tangent(k, surfaces, (free[0, i], free[1, i], free[2, i]))
+        place = free[0, i], free[1, i], free[2, i]
+        for k in range(len(surfaces.radii)):
+            gap = tangent(k, surfaces, place)[1] if surfaces.radii[k] != OTHER else 0.0
             if (gap < 0.0 and (all_nodes[k] or members[i, k])) or (returning and walls.rebound[i, k] > 0.0):
                 walls.room[m] = i
                 m += 1
@@ -631,22 +619,18 @@ class ExplicitContact(NodeWalls):
         """
         bodies, time, self._part = self.motion.bodies, balance.time, balance.acting
         failure: SimulationFailure | None = None
-        chosen, sought, first, found = some, None, True, None
+        sought, first, found = None, True, None
 
         def forces() -> tuple[np.ndarray, Callable[[], np.ndarray] | None]:
-            nonlocal failure, chosen, sought, first, found
+            nonlocal failure, sought, first, found
             fresh, first = first, False
             try:
                 x = place()
-                if sought is None or bodies.strays(sought, self.limits):
-                    if sought is not None:
-                        self.limits *= 2.0
-                    if some is not None and sought is not None:
-                        raise OutOfReachError
-                    sought = bodies.way
-                    # coupled nodes may be anywhere in the next trial
-                    chosen = self._near_bodies(x, time) if some is None and not coupled else some
-                found = self.project(x, stiffness, time, chosen)
+                sought = bodies.way if sought is None else sought
+                if some is not None and bodies.strays(sought, self.limits):
+                    self.limits *= 2.0
+                    raise OutOfReachError
+                found = self.project(x, stiffness, time, some)
             except SimulationFailure as met:  # raised once all ranks have left the iteration
                 failure = failure or met
                 return np.zeros((2, len(bodies.at), 3)), lambda: np.zeros((len(bodies.at), 6, 6))
@@ -660,16 +644,6 @@ class ExplicitContact(NodeWalls):
         if not settled:
             raise SimulationFailure(self.unsettled_message())
         return found
-
-    def _near_bodies(self, x: np.ndarray, time: float) -> tuple[np.ndarray, np.ndarray]:
-        """Return the nodes that rebound, and those that walls may meet at a time [s] which move as far as is assumed,
-        of nodes at (owned, 3)."""
-        arms = np.zeros(len(x))
-        for pivot in self.motion.bodies.pivots(1.0):
-            np.maximum(arms, ((x - pivot) ** 2).sum(axis=1), out=arms)
-        reach = self.limits[0] + self.limits[1] * np.sqrt(arms)
-        near = np.flatnonzero(self.near(x, self.motion.poses(time), reach))
-        return np.flatnonzero((self._memory[0] > 0.0).any(axis=1)) if self.rebounds else near[:0], near
 
     def _slopes(self, found: Stopped, stiffness: np.ndarray, time: float) -> np.ndarray:
         """Return this rank's share of the derivatives of :func:`slopes_of_walls`."""

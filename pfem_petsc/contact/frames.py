@@ -12,7 +12,7 @@ from mpi4py import MPI
 
 from ..mechanics.compiled import inlined, kernel
 from ..tolerances import FREE_PART
-from .rotations import along, cross, dot, free_components, minus, put, times, vector
+from .rotations import along, dot, free_components, put, times, vector
 
 if TYPE_CHECKING:
     from .rows import Alike, RowSet
@@ -335,7 +335,7 @@ class RelativeCoordinates:
         return planes
 
 
-_FILLED = "basis", "inverse", "lower", "upper", "rows", "ratios", "shared", "bounds"
+_FILLED = "basis", "lower", "upper", "rows", "ratios", "shared", "bounds"
 
 
 def build_frames(nodes: np.ndarray, planes: Planes, tolerance: float = 0.0, least: float = MIN_VOLUME) -> NodalFrames:
@@ -350,8 +350,12 @@ def build_frames(nodes: np.ndarray, planes: Planes, tolerance: float = 0.0, leas
     """
     frames = NodalFrames(nodes, planes.offsets.shape[1])
     frames.places, frames.normals = planes.places, planes.normals
-    output = tuple(getattr(frames, name) for name in _FILLED)
-    frames.oblique, frames.contradiction = _build(planes, tolerance, least, output)
+    lower, upper = frames.lower, frames.upper
+    _build(planes, least, tuple(getattr(frames, name) for name in _FILLED))
+    frames.inverse, frames.oblique = np.linalg.inv(frames.basis), bool((frames.basis != _AXES).any())
+    infeasible, crossed = np.flatnonzero((lower > upper + tolerance).any(axis=1)), lower > upper
+    frames.contradiction = int(infeasible[0]) if len(infeasible) else -1
+    lower[crossed] = upper[crossed] = 0.5 * (lower[crossed] + upper[crossed])
     frames.offsets = np.where(frames.rows >= 0, planes.offsets, -np.inf)
     return frames
 
@@ -384,14 +388,12 @@ def _complete(basis, taken, spanned, n):
 
 
 @kernel
-def _build(planes, tolerance, least, output):
-    """Fill the arrays of :class:`NodalFrames` that ``_FILLED`` names; return whether any basis is not the identity, and
-    a node with infeasible bounds, else -1."""
+def _build(planes, least, output):
+    """Fill the arrays of :class:`NodalFrames` that ``_FILLED`` names."""
     fixed, normals, offsets, rank, places = planes
-    basis, inverse, lower, upper, rows, ratios, shares, bounds = output
+    basis, lower, upper, rows, ratios, shares, bounds = output
     m, w = offsets.shape
     taken, done, spanned = np.zeros(3, dtype=np.bool_), np.zeros(w, dtype=np.bool_), np.zeros((3, 3))
-    oblique, contradiction = False, -1
     for i in range(m):
         n, volume, own = 0, 1.0, basis[i]
         for c in range(3):
@@ -445,14 +447,3 @@ def _build(planes, tolerance, least, output):
             else:
                 upper[i, slot] = min(upper[i, slot], bounds[i, wall])
         _complete(own, taken, spanned, n)
-        determinant = dot(vector(own, 0), cross(vector(own, 1), vector(own, 2)))
-        for r in range(3):
-            column = cross(vector(own, (r + 1) % 3), vector(own, (r + 2) % 3))
-            put(inverse[i].T, r, times(1.0 / determinant, column))
-            turn = minus(vector(own, r), vector(_AXES, r))
-            oblique = oblique or not turn[0] == turn[1] == turn[2] == 0.0
-            if lower[i, r] > upper[i, r]:
-                if lower[i, r] > upper[i, r] + tolerance and contradiction < 0:
-                    contradiction = i
-                lower[i, r] = upper[i, r] = 0.5 * (lower[i, r] + upper[i, r])
-    return oblique, contradiction

@@ -460,11 +460,9 @@ class OutOfReachError(Exception):
 
 
 class Stopped(NamedTuple):
-    """Nodes (m,) that walls stop: positions and forces (m, 3) [m], [N], WallForces, and the Arrivals of those that are
-    not tied; None for none."""
+    """Nodes (m,) that walls stop: forces (m, 3) on them [N], WallForces, and the Arrivals of those that are not tied;
+    None for none."""
 
-    nodes: np.ndarray
-    places: np.ndarray
     force: np.ndarray
     walls: WallForces
     given: Arrivals | None
@@ -538,12 +536,12 @@ class ExplicitContact(NodeWalls):
                 found = self.project(x, stiffness, time)
             else:
                 found = self.push_walls(lambda: x, stiffness, pushing)
-            nodes, places, force, walls, _ = self.book(found, time)
+            force, walls, _ = self.book(found, time)
         except SimulationFailure:  # until other ranks know of it, the other nodes stay at walls
             u[:] = x - predictor
             raise
-        u[nodes] += places - x[nodes]
-        return nodes, force, walls
+        u[walls.nodes] += walls.places - x[walls.nodes]
+        return walls.nodes, force, walls
 
     def placeless(self, node: int, why: int, x: np.ndarray, time: float) -> str:
         """Return the message about an owned node whose place near x (3,) at a time [s] :func:`press_nodes` did not
@@ -553,18 +551,13 @@ class ExplicitContact(NodeWalls):
         if why == INFEASIBLE:
             return self.infeasible_message(node, offsets[0])
         if why == JAMMED:
-            return self.unsettled_friction(node, normals[0])
+            return jam(self, node, normals[0]) or (
+                f"the friction of node {self.mesh.node_ids[node]} on its walls did not converge; reduce time.step"
+            )
         return (
             f"the position of node {self.mesh.node_ids[node]} on curved walls did not converge in {_CURVED_ROUNDS} "
             "iterations: walls and supports may be infeasible together; move the walls apart, free the node, or "
             "reduce time.step"
-        )
-
-    def unsettled_friction(self, node: int, normals: np.ndarray) -> str:
-        """Return the message about an owned node without a solution of its friction at walls with ``normals`` (w,
-        3)."""
-        return jam(self, node, normals) or (
-            f"the friction of node {self.mesh.node_ids[node]} on its walls did not converge; reduce time.step"
         )
 
     def walls_at(self, poses: Poses, part: float) -> Any:
@@ -647,7 +640,7 @@ class ExplicitContact(NodeWalls):
 
     def _slopes(self, found: Stopped, stiffness: np.ndarray, time: float) -> np.ndarray:
         """Return this rank's share of the derivatives of :func:`slopes_of_walls`."""
-        bodies, nodes, places, given = self.motion.bodies, found.nodes, found.places, found.given
+        bodies, nodes, places, given = self.motion.bodies, found.walls.nodes, found.walls.places, found.given
         if not len(nodes):
             return np.zeros((len(bodies.at), 6, 6))
         body = np.full(len(self.walls), -1)
@@ -723,15 +716,14 @@ class ExplicitContact(NodeWalls):
         own[np.arange(len(tied)), self.first[walls]] = True
         start = places if self.state is None else self.state.position[tied]
         held = self.sums(tied, every, (places, start + self._part * (places - start)), own)
-        nodes, moved = np.append(found.nodes, tied), np.vstack([found.places, places])
         sums = WallForces(
             *(getattr(sums, name) + getattr(held, name) for name in WallForces.sums),
-            nodes,
+            np.append(sums.nodes, tied),
             np.vstack([sums.touching, own]),
-            moved,
+            np.vstack([sums.places, places]),
             sums.friction,
         )
-        return Stopped(nodes, moved, np.vstack([found.force, pull]), sums, found.given)
+        return Stopped(np.vstack([found.force, pull]), sums, found.given)
 
     def press_some(
         self,
@@ -761,7 +753,7 @@ class ExplicitContact(NodeWalls):
         """Press nodes (m,) that are ``free`` to move to (m, 3), where a failure leaves what is found."""
         w, state = len(self.wall_of), self.state
         if len(nodes) == 0:
-            return Stopped(nodes, np.empty((0, 3)), np.empty((0, 3)), self.nothing, None)
+            return Stopped(np.empty((0, 3)), self.nothing, None)
         before = poses if state is None else self._poses_before()
         bounces, others, at = self.rebounds, not self.known.all(), free
         start, drift = free if state is None else state.position[nodes], np.zeros_like(free)
@@ -792,16 +784,16 @@ class ExplicitContact(NodeWalls):
         if failed >= 0:
             free[:] = places
             raise SimulationFailure(self.placeless(nodes[failed], why, places[failed], poses.time))
-        return Stopped(nodes, places, force, WallForces(*sums, nodes, touching, places, friction), given)
+        return Stopped(force, WallForces(*sums, nodes, touching, places, friction), given)
 
     def book(self, found: Stopped, time: float) -> Stopped:
         """Keep the memory of the nodes that walls stop at the end of a step, at a time [s]; return them."""
         given = found.given
         if not self.rebounds or given is None:
             return found
-        nodes = found.nodes[: len(given.free)]
+        nodes = found.walls.nodes[: len(given.free)]
         if len(self.motion.bodies.turners):
-            poses, places = self.motion.poses(time), found.places[: len(nodes)]
+            poses, places = self.motion.poses(time), found.walls.places[: len(nodes)]
             unpushed = self.ways(given.start, self._poses_before(), self.motion.poses_without_contact(time))
             planes, _ = planes_of(places, given.free, given, self.walls_at(poses, self._part))
             self._set_rebounds(given, planes.normals, unpushed)

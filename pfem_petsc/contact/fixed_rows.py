@@ -19,7 +19,7 @@ class TwoNodeRows:
     normals, least : (p, 3) unit directions; (p,) bounds [m], of rows n . (x_2 - x_1) >= least
     along : (2, p) squared lengths of the free parts of the directions
     counted : (p,) bool, rows whose second node this rank owns
-    closed : (p,) bool, rows that have closed and not opened since; restitution : (p,) coefficients
+    restitution : (p,) coefficients
     """
 
     def __init__(self, rows: RowSet) -> None:
@@ -36,7 +36,7 @@ class TwoNodeRows:
             self.least = 0.0 - rows.values(np.zeros((len(rows.numbers), 3)))[self.at]
         self._free = rows.free[self.ends]
         self.along = (self._free * self.normals**2).sum(axis=2)
-        self.closed, self.restitution = np.zeros(len(self.at), dtype=bool), rows.restitution[self.at]
+        self.restitution = rows.restitution[self.at]
 
     def gather(self, values: np.ndarray) -> np.ndarray:
         """Return values (2, p, ...) at the nodes of rows from those at owned nodes (owned, ...). Collective."""
@@ -70,9 +70,9 @@ class TwoNodeRows:
         gives = (self.along / self.gather(mass)).sum(axis=0)
         return 1.0 / np.maximum(gives, 1e-300)
 
-    def close(self, at: np.ndarray, force: np.ndarray, ends: np.ndarray, slack: float) -> float:
-        """Return the energy [J] that closing rows lose of those whose second nodes this rank owns, see
-        :mod:`~pfem_petsc.stepping.impact`; update :attr:`closed`.
+    def close(self, at: np.ndarray, force: np.ndarray, ends: np.ndarray, slack: float) -> tuple[np.ndarray, float]:
+        """Return which rows are closed (m,), and the energy [J] that those lose which close and whose second nodes this
+        rank owns, see :mod:`~pfem_petsc.stepping.impact`.
 
         Parameters
         ----------
@@ -83,8 +83,7 @@ class TwoNodeRows:
         apart = (ends[1] - ends[0])[:, :9].reshape(-1, 3, 3)
         distance, speed, pull = np.einsum("mi,mki->km", self.normals[at], apart)
         distance, fresh = distance - self.least[at], force > 0.0
-        self.closed[at] = fresh | (distance <= slack)
         square = np.maximum(speed * speed - 2.0 * pull * np.maximum(distance, 0.0), 0.0)
         gives = (self.along[:, at] / ends[:, :, 9]).sum(axis=0)
         lost = 0.5 * square / np.maximum(gives, 1e-300) * (1.0 - self.restitution[at] ** 2)
-        return float(lost[fresh & (speed < 0.0) & self.counted[at]].sum())
+        return fresh | (distance <= slack), float(lost[fresh & (speed < 0.0) & self.counted[at]].sum())

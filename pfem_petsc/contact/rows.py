@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from mpi4py import MPI
+from petsc4py import PETSc
 
 from ..errors import SimulationFailure
 from ..mechanics.compiled import kernel
@@ -36,14 +37,10 @@ def owner_starts(mesh: DistributedMesh) -> np.ndarray:
 
 def petsc_numbers(mesh: DistributedMesh, numbers: np.ndarray) -> np.ndarray:
     """Return the PETSc numbers of nodes given by mesh numbers (n,), which any rank may own. Collective."""
-    comm, ids = mesh.comm, mesh.node_ids[: mesh.n_owned]
-    to_slab = Router(comm, slab_of(ids, mesh.n_nodes, comm.size))
-    known, at = to_slab.send(ids), to_slab.send(mesh.first_node + np.arange(mesh.n_owned))
-    order = np.argsort(known)
-    wanted, place = np.unique(numbers, return_inverse=True)
-    asking = Router(comm, slab_of(wanted, mesh.n_nodes, comm.size))
-    asked = asking.send(wanted)
-    return asking.reply(at[order[np.searchsorted(known[order], asked)]])[place.ravel()]
+    order = PETSc.AO().createMemoryScalable(mesh.node_ids[: mesh.n_owned].astype(PETSc.IntType), comm=mesh.comm)
+    found = order.app2petsc(numbers.astype(PETSc.IntType))
+    order.destroy()
+    return found.astype(np.int64)
 
 
 def once(rows: np.ndarray) -> np.ndarray:

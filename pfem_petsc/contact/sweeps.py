@@ -121,21 +121,17 @@ def _slides_along_guide(count, rows, size, pushes):
     normal force without friction, N (n_f - mu s_f/|s|) = N_0 n_f: no sweeps are needed, which creep where the normal
     is almost across the guide.
     """
-    a, free = -1, -1
+    a, free, pressing, moving = -1, -1, 0, 0
     for b in range(count):
         if pushes.normal[b] > 0.0:
-            if a >= 0:
-                return False
-            a = b
-    if a < 0 or not rows.friction[a, 0] > 0.0:
+            a, pressing = b, pressing + 1
+    if pressing != 1 or not rows.friction[a, 0] > 0.0:
         return False
     soft = _softness(a, rows)
     for c in range(3):
         if soft[c] > 0.0:
-            if free >= 0:
-                return False
-            free = c
-    if free < 0:
+            free, moving = c, moving + 1
+    if moving != 1:
         return False
     n = vector(rows.normals, a)
     slip = _across(_slip_of(a, rows, pushes.moves), n)

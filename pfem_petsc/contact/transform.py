@@ -242,7 +242,7 @@ class RowCoordinates:
         force, own = g[node, component] / self._scale[row], np.zeros(w.shape)
         own[node, component] = np.where((w[node, component] <= lower[node, component]) & (force > noise), force, 0.0)
         self.constraints.release()
-        self.constraints.jacobian = self.jacobian
+        self.constraints.gradients = self.jacobian
         self.constraints.force[self._placed] = self._all(own)[self._pivot[self._placed]]
 
     def set_forces(self, nodes: np.ndarray, normal: np.ndarray, drag: np.ndarray) -> None:

@@ -330,7 +330,7 @@ class Impacts:
         """Return the loss of closing rows over two nodes whose second nodes this rank owns, with the reduced mass."""
         links, mass = self.model.links, self.model.inertia.mass
         two, force = links.two, links.force[links.two.at]
-        at = np.flatnonzero((force > 0.0) != two.closed)
+        at = np.flatnonzero((force > 0.0) != links.closed[two.at])
         if len(at) == 0:
             return 0.0
 
@@ -338,4 +338,6 @@ class Impacts:
             free_v, free_a = self._free(nodes, motion, load)
             return np.column_stack([x[nodes], free_v, free_a, mass[nodes]])
 
-        return two.close(at, force[at], links.rows.gather_of(two.at[at], of_nodes), self.slack)
+        ends = links.rows.gather_of(two.at[at], of_nodes)
+        links.closed[two.at[at]], lost = two.close(at, force[at], ends, self.slack)
+        return lost

@@ -17,7 +17,7 @@ from ..tolerances import FIXED_POINT, PROJECTED, RANK
 from .friction import jam
 from .node_walls import TURN, NodeWalls, WallForces
 from .projection import INFEASIBLE, JAMMED, NodesAtPlanes, Planes, new_pressed, press
-from .rotations import NOWHERE, across, add_to, along, cross, dot, minus, put, vector
+from .rotations import NOWHERE, across, add_to, along, cross, dot, free_components, minus, put, vector
 from .surfaces import OTHER, Surfaces, beyond, is_round, tangent
 from .tied import Ties
 
@@ -351,16 +351,13 @@ def press_nodes(given, walls, sums, curved, rough, several):
     total, touching, dissipated = np.zeros((m, 3)), np.zeros((m, w), dtype=np.bool_), 0.0
     for j in range(m):
         way = minus(vector(found.x, j), vector(start, j))
-        acts = along(vector(start, j), walls.part, way)  # where the forces of the balance do
+        acts, last = along(vector(start, j), walls.part, way), -1  # where the forces of the balance do
         for k in range(w):
             if found.normal[j, k] == 0.0:
                 continue
             touching[j, k], wall = True, wall_of[k]
-            sums.contacts[wall] += 1
-            for earlier in range(k):  # a node in several slots of a wall counts once
-                if wall_of[earlier] == wall and touching[j, earlier]:
-                    sums.contacts[wall] -= 1
-                    break
+            sums.contacts[wall] += 1 if wall != last else 0  # a node in several slots of a wall counts once
+            last = wall
             drag = vector(found.drag[j], k)
             dissipated -= dot(drag, minus(way, vector(ways[j], k)))
             force = along(drag, found.normal[j, k], vector(normals[j], k))
@@ -411,8 +408,7 @@ def _slope_of_plane(j, k, weight, normal, given, held, walls):
             slip[:] = 0.0
         slope -= rough * weight * np.outer(slip, normal)
         across_slip = np.eye(3) - np.outer(normal, normal) - np.outer(slip, slip)
-        for c in range(3):
-            slope[c] += (0.0 if held.fixed[j, c] else held.stiffness[j] * turning) * across_slip[c]
+        slope += np.where(held.fixed[j], 0.0, held.stiffness[j] * turning).reshape(3, 1) * across_slip
     return slope
 
 
@@ -425,28 +421,23 @@ def slopes_of_walls(given, held, walls, levers):
     """
     normals = planes_of(held.places[: len(given.free)], given.free, given, walls)[0].normals
     total, w = np.zeros((levers.pivots.shape[1], 6, 6)), held.touching.shape[1]
-    rows, weights, whole = np.zeros((w, 3)), np.empty(w), np.empty((3, 6))
+    rows, whole = np.zeros((w, 3)), np.empty((3, 6))
     for j in range(len(held.places)):
-        count, stiffness, tied = 0, held.stiffness[j], j >= len(normals)
+        tied = j >= len(normals)
         for k in range(w):
-            if held.touching[j, k]:
-                for c in range(3):
-                    rows[count, c] = 0.0 if held.fixed[j, c] or tied else normals[j, k, c]
-                count += 1
-        inverse = np.linalg.pinv(rows[: max(count, 1)].copy(), RANK)
-        for k in range(count):  # the diagonal of k (N N^T)^-1
-            weights[k] = stiffness * (inverse[0, k] ** 2 + inverse[1, k] ** 2 + inverse[2, k] ** 2)
-        count = 0
+            free = NOWHERE
+            if held.touching[j, k] and not tied:
+                free = free_components(vector(normals[j], k), held.fixed[j])
+            put(rows, k, free)
+        inverse = np.linalg.pinv(rows, RANK)
         for k in range(w):
-            if not held.touching[j, k]:
+            i = levers.body[k]
+            if not held.touching[j, k] or i < 0:
                 continue
-            count, i = count + 1, levers.body[k]
-            if i < 0:
-                continue
-            if tied:
-                slope = np.diag(np.where(held.fixed[j], 0.0, stiffness))
-            else:
-                slope = _slope_of_plane(j, k, weights[count - 1], normals[j, k].copy(), given, held, walls)
+            slope = np.diag(np.where(held.fixed[j], 0.0, held.stiffness[j]))
+            if not tied:
+                weight = held.stiffness[j] * (inverse[:, k] ** 2).sum()  # of the diagonal of k (N N^T)^-1
+                slope = _slope_of_plane(j, k, weight, normals[j, k].copy(), given, held, walls)
             arms = np.stack((held.acts[j] - levers.pivots[0, i], held.places[j] - levers.pivots[1, i]))
             lever = across(arms)
             whole[:, :3], whole[:, 3:] = slope, -(slope @ lever[1])
@@ -595,8 +586,8 @@ class ExplicitContact(NodeWalls):
         coupled: bool = False,
         some: tuple[np.ndarray, np.ndarray] | None = None,
     ) -> Stopped:
-        """Find the final positions of walls with mass in an explicit step; return the nodes that walls stop then, which
-        :meth:`book` is to be told. Collective.
+        """Find the final positions of walls with mass, if any, in an explicit step; return the nodes that walls stop
+        then, which :meth:`book` is to be told. Collective.
 
         Parameters
         ----------
@@ -737,10 +728,7 @@ class ExplicitContact(NodeWalls):
 
         ``x`` (owned, 3), ``stiffness`` (owned,) : of these nodes, see :meth:`explicit`; ``balance`` : of the step
         """
-        self._part = balance.acting
-        if self.motion.bodies.any:
-            return self.book(self.push_walls(lambda: x, stiffness, balance, some=some), balance.time)
-        return self.book(self.project(x, stiffness, balance.time, some), balance.time)
+        return self.book(self.push_walls(lambda: x, stiffness, balance, some=some), balance.time)
 
     def _press_some(
         self,

@@ -383,12 +383,8 @@ class RowSet:
 
     def alike_of(self, which: np.ndarray) -> list[Alike]:
         """Return some of the groups, (groups,) bool, collected by shape."""
-        found = []
-        for each in self.alike:
-            some = which[self.group_of_row[each.rows[:, 0]]]
-            if some.any():
-                found.append(Alike(each.rows[some], each.nodes[some], each.ends[some]))
-        return found
+        parts = ((each, which[self.group_of_row[each.rows[:, 0]]]) for each in self.alike)
+        return [Alike(each.rows[some], each.nodes[some], each.ends[some]) for each, some in parts if some.any()]
 
     def gather(self, values: np.ndarray) -> np.ndarray:
         """Return float64 values (n, ...) at the nodes from those at owned nodes (owned, ...). Collective."""

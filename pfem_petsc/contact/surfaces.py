@@ -38,19 +38,15 @@ class Surfaces(NamedTuple):
     def of(cls, walls: Sequence[BaseWall], turning: np.ndarray) -> Self:
         """Return the surfaces of walls at rest; ``turning`` (w,) bool: walls that turn, which are other ones."""
         normals, centres, axes = np.zeros((3, len(walls), 3))
-        made = cls(normals, np.zeros(len(walls)), centres, axes, np.zeros(len(walls)))
-        for k, wall in enumerate(walls):
-            kind = type(wall)
-            if turning[k]:
-                made.radii[k] = OTHER
-            elif wall.flat:
-                made.normals[k], made.offsets[k] = wall.normal, wall.offset
+        made = cls(normals, np.zeros(len(walls)), centres, axes, np.full(len(walls), OTHER))
+        for k in np.flatnonzero(~turning):
+            wall, kind = walls[k], type(walls[k])
+            if wall.flat:
+                made.normals[k], made.offsets[k], made.radii[k] = wall.normal, wall.offset, 0.0
             # a class that derives from such a wall may be another surface
             elif (kind.planes, kind.gaps) == (RoundWall.planes, RoundWall.gaps):
                 made.normals[k], made.axes[k] = wall.sign * wall.across, wall.axis
                 made.centres[k], made.radii[k] = wall.centre, wall.sign * wall.radius
-            else:
-                made.radii[k] = OTHER
         return made
 
     def copy(self) -> Self:

@@ -197,11 +197,8 @@ class Restitution(Treatment):
             force = 0.5 * links.two.apart(ends[:, :, :3])  # half the relative force between the ends
             force[force <= _NONE * links.force] = 0.0
             self._push = self._pressed & self._treated, force, links.two.apart(ends[:, :, 3:])
-        if not rebounds:
-            return
-        self._speed = state.v
-        if not scheme.explicit:
-            self._free = self._without_contact(np.arange(len(state.v)))
+        if rebounds and not scheme.explicit:
+            self._speed, self._free = state.v, self._without_contact(np.arange(len(state.v)))
 
     @property
     def _treated(self) -> np.ndarray:

@@ -15,7 +15,7 @@ from ..errors import NotConverged
 from ..integrators.base import Balance, State
 from ..tolerances import BEYOND, ON_BOUND, PROJECTED
 from .contact import Candidates, expected_candidates
-from .frames import MIN_VOLUME, NodalFrames, RowPlanes
+from .frames import MIN_VOLUME, NodalFrames
 from .friction import StepFriction, planes_at_rest
 from .node_walls import WallForces, held_by_supports
 from .projection import NodesAtPlanes, pressed, project
@@ -131,18 +131,14 @@ def is_off_surface(
     if contact.find_faces(at, x[at], poses, tolerance):
         return True
     normals, _ = contact.planes(strengths > 0.0, x[at], poses, contact.acting(at, x[at], poses, part), at)
+    # far from the origin, the rounding of positions turns normals by more
+    moved = np.abs(x[at] - frames.places).max(axis=1) > PROJECTED * contact.size
     for k in np.flatnonzero(~contact.flat):
-        wall, pressed = contact.wall_of[k], strengths[:, k] > 0.0
-        passed = ~pressed & (frames.rows[:, k] >= 0)
-        if passed.any() and (contact.gap(wall, x[at[passed]], poses) < -tolerance).any():
+        gaps, pressed = contact.gap(contact.wall_of[k], x[at], poses), strengths[:, k] > 0.0
+        turned = moved & (np.abs(normals[:, k] - frames.normals[:, k]).max(axis=1) > ON_BOUND)
+        passed = (frames.rows[:, k] >= 0) & (gaps < -tolerance)
+        if np.where(pressed, turned | (np.abs(gaps) > tolerance), passed).any():
             return True
-        if pressed.any():
-            turn = np.abs(normals[pressed, k] - frames.normals[pressed, k]).max(axis=1)
-            # far from the origin, the rounding of positions turns normals by more
-            moved = np.abs(x[at[pressed]] - frames.places[pressed]).max(axis=1)
-            turned = (turn > ON_BOUND) & (moved > PROJECTED * contact.size)
-            if np.abs(contact.gap(wall, x[at[pressed]], poses)).max() > tolerance or turned.any():
-                return True
     return False
 
 
@@ -245,13 +241,10 @@ class ActiveSet:
             candidates = candidates.beside(relative.nodes)
         frames, tied = NodalFrames(candidates.nodes, slots), contact.ties.nobody
         if candidates.anywhere:
-            rows = RowPlanes.none(x[candidates.nodes], slots - len(contact.wall_of))
-            if relative is not None:
-                rows = relative.planes(x, candidates.nodes)
             least = MIN_VOLUME if self._iterations < _PATIENCE else _SMALL_VOLUME
             tied_ones = contact.ties.held[candidates.nodes]
             untied = replace(candidates, applicable=candidates.applicable & ~tied_ones[:, None])
-            frames = contact.frames(untied, x, self.balance, rows, least)
+            frames = contact.frames(untied, x, self.balance, slots, relative, least)
             tied = contact.ties.pin(frames, x, self.balance.time)
             self.friction.apply(frames)
         met = frames if candidates.anywhere else None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import compress
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -20,7 +21,7 @@ from .explicit import Arrivals, impact_square, planes_of, rebound_lift
 from .fixed_rows import TwoNodeRows
 from .friction import FAST, planes_at_rest, sliding
 from .projection import Planes
-from .rows import FreeNodes, RowSet, WallsOfNodes, free_positions, last_forces, push_nodes
+from .rows import FreeNodes, RowSet, WallsOfNodes, free_positions, push_nodes
 
 if TYPE_CHECKING:
     from ..case.schema import Case
@@ -29,6 +30,8 @@ if TYPE_CHECKING:
     from .contact import Contact
 
 PACKAGE = "pfem_petsc.contact.constraints"
+
+_KEPT = "force", "gradients", "closed", "drag", "rebound", "arrival"  # of rows, by the names of attributes
 
 
 class PairRows(Constraint):
@@ -157,8 +160,9 @@ class ConstraintSet:
     columns : of the tables in the history, like ``pair/NAME``, pairs first
     dynamic : whether rows of any table come and go, see :meth:`find`
     rows : RowSet, another one whenever the rows change
-    force : (r,) of the rows here in the last step [N]; jacobian : (r, k, 3) gradients along which these act; the same
-        on all ranks that have a row
+    force : (r,) of the rows here in the last step [N]; gradients : (r, k, 3) along which these act; the same on all
+        ranks that have a row
+    closed : (r,) uint8, 1 for rows over two nodes that have closed and not opened since
     drag : (r, 3) friction forces of the rows in the last step, times the weights of their nodes [N]
     rebound, arrival : (r,) memory of rows that have closed, see :class:`~pfem_petsc.contact.explicit.Arrivals`
     friction : energy that friction of the rows that this rank counts dissipates in the step solved for [J]
@@ -195,7 +199,7 @@ class ConstraintSet:
         self.alone = not self.walled and self.mesh.comm.allreduce(self.two.every, op=MPI.LAND)
         own = rows.partners.alone and not self.dynamic and not self.walled and len(self.two.at) == len(rows.source)
         self.separate = self.mesh.comm.allreduce(own, op=MPI.LAND)
-        self._x = np.empty((len(rows.numbers), 3))
+        self._x, self.closed = np.empty((len(rows.numbers), 3)), np.zeros(len(rows.source), dtype=np.uint8)
         self.release()
 
     def __bool__(self) -> bool:
@@ -217,7 +221,7 @@ class ConstraintSet:
 
     def release(self) -> None:
         """Set all forces to zero."""
-        self.force, self.jacobian = np.zeros(len(self.rows.source)), self.rows.fixed_jacobian
+        self.force, self.gradients = np.zeros(len(self.rows.source)), self.rows.fixed_jacobian
         self.drag, self.rebound, self.arrival = np.zeros((len(self.force), 3)), *np.zeros((2, len(self.force)))
 
     @property
@@ -261,25 +265,13 @@ class ConstraintSet:
 
     def _of_counted(self) -> dict[str, np.ndarray]:
         """Return what is kept of the rows that this rank counts."""
-        closed = np.zeros(len(self.force), dtype=np.uint8)
-        closed[self.two.at] = self.two.record.closed
-        counted = self.rows.counted
-        kept = {
-            "rows.force": self.force,
-            "rows.gradients": self.jacobian,
-            "rows.closed": closed,
-            "rows.drag": self.drag,
-            "rows.rebound": self.rebound,
-            "rows.arrival": self.arrival,
-        }
-        return {name: values[counted] for name, values in kept.items()}
+        return {f"rows.{name}": getattr(self, name)[self.rows.counted] for name in _KEPT}
 
     def _take(self, counted: dict[str, np.ndarray], rows: RowSet) -> None:
         """Set the forces of all rows here from those of the rows counted in a set. Collective."""
-        values = (self.rows.of_counted(values, rows) for values in counted.values())
-        self.force, jacobian, closed, self.drag, self.rebound, self.arrival = values
-        self.jacobian = np.where(self.rows.fixed[:, None, None], self.rows.fixed_jacobian, jacobian)
-        self.two.record.closed[:] = closed[self.two.at] > 0
+        for name in _KEPT:
+            setattr(self, name, self.rows.of_counted(counted[f"rows.{name}"], rows))
+        self.gradients = np.where(self.rows.fixed[:, None, None], self.rows.fixed_jacobian, self.gradients)
 
     def explicit(self, balance: Balance, state: State, u: np.ndarray, stiffness: np.ndarray) -> np.ndarray | None:
         """Return the forces (n, 3) [N] on the nodes of rows in a step in which each node is solved on its own, with
@@ -322,43 +314,39 @@ class ConstraintSet:
         lift, before = self._lift(pull), self.force > 0.0
         force = np.zeros(len(before))
         try:
-            pushes, self.jacobian, system = rows.project(nodes, self.contact.tolerance, stopping, lift)
-            force = pushes.force
+            pushes, self.gradients = rows.project(nodes, self.contact.tolerance, stopping, lift)
+            force = pushes.normal
         finally:
             self.two.agree(force)  # also after a failure, which other ranks may not have
-        self.force, self.drag, self.friction = pushes.force, pushes.drag, 0.0
+        self.force, self.drag, self.friction = force, pushes.drag, 0.0
         if self.rebounds:
             fresh, arrived = (self.force > 0.0) & ~before & (rows.restitution > 0.0), rows.values(start)
             self.rebound = np.where(fresh, impact_square(-moved, arrived, pull), 0.0)
             self.arrival = np.where(fresh, arrived, 0.0)
         if rows.rubs:
-            slips = system.slips + rows.slips(pushes.moves)
-            self.friction = -float((self.drag * slips)[rows.counted].sum())
+            self.friction = -float((self.drag * rows.slips(x - start + pushes.moves))[rows.counted].sum())
         if not self.force.any():
             return None
-        load = rows.forces(self.jacobian, self.force, self.drag)
+        load = rows.forces(self.gradients, self.force, self.drag)
         return load if load[rows.mine].any() else None
 
     def _starts(self, balance: Balance, state: State) -> tuple[np.ndarray | None, ...]:
         """Return positions at the start of a step and displacements without forces (n, 3) [m], tied nodes and where to
         (n, 4), and the memory of walls (2, n, w); nothing of what no row or wall needs. Collective."""
-        walls, parts = self._walls, []
+        walls = self._walls
         rebounds, at_start = self.rebounds or walls.rebounds, balance.acting < 1.0
         starts = rebounds or self.rows.rubs or walls.rubs or (at_start and (self._turning or walls.curved))
-        if starts:
-            parts.append(lambda at: state.position[at])
-        if rebounds:
-            parts.append(lambda at: balance.predictor[at] - state.position[at])
-        if walls.ties:
-            parts.append(lambda at: walls.held(at, balance.time))
-        if walls.rebounds:
-            parts.append(walls.memory)
-        none = np.empty((2, len(self._x), 0))
-        if not parts:
+        none, needed = np.empty((2, len(self._x), 0)), (starts, rebounds, walls.ties, walls.rebounds)
+        if not any(needed):
             return None, none[0], none[0], none
-        table = self.rows.collect(lambda at: np.column_stack([part(at) for part in parts]))
-        widths = np.cumsum([3 * starts, 3 * rebounds, 4 * walls.ties])
-        start, drift, held, memory = np.split(table, widths, axis=1)
+        parts = (
+            lambda at: state.position[at],
+            lambda at: balance.predictor[at] - state.position[at],
+            lambda at: walls.held(at, balance.time),
+            walls.memory,
+        )
+        table = self.rows.collect(lambda at: np.column_stack([part(at) for part in compress(parts, needed)]))
+        start, drift, held, memory = np.split(table, np.cumsum([3 * starts, 3 * rebounds, 4 * walls.ties]), axis=1)
         memory = np.stack(np.split(memory, 2, axis=1)) if walls.rebounds else none
         return start if starts else None, drift, held, memory
 
@@ -392,7 +380,10 @@ class ConstraintSet:
         rows, totals = self.rows, np.zeros((len(self.names), 3))
         if not self:
             return totals
-        last_forces(rows.counted, rows.source, rows.last, rows.loads(self.jacobian, self.force, self.drag), totals)
+        at = np.flatnonzero(rows.counted & (self.force != 0.0))
+        last, force = rows.last[at], self.force[at, None]
+        push = force * self.gradients[at, last] + rows.weights[at, last][:, None] * self.drag[at]
+        np.add.at(totals, rows.source[at], push)
         return totals
 
     def tables(self, owned: int) -> np.ndarray:
@@ -403,7 +394,7 @@ class ConstraintSet:
 
     def add_forces(self, contact: np.ndarray, factor: float = 1.0) -> None:
         """Add the forces, times a factor, to those on the nodes (owned, 3) [N]."""
-        contact[self.rows.here] += factor * self.rows.forces(self.jacobian, self.force, self.drag)[self.rows.mine]
+        contact[self.rows.here] += factor * self.rows.forces(self.gradients, self.force, self.drag)[self.rows.mine]
 
     def check(self, treatment: str, explicit: bool, length: float) -> None:
         """Check that the model is compatible with the rows and that none is violated at the start. Collective.
@@ -524,9 +515,9 @@ class ConstraintSet:
         if not self:
             return self.force
         x, v = self.rows.gather(x), self.rows.gather(v)
-        self.jacobian = self.rows.gradients(x)
+        self.gradients = self.rows.gradients(x)
         closed = np.abs(self.rows.values(x)) <= slack
-        closed &= np.abs(self.rows.along(self.jacobian, v)) <= still
+        closed &= np.abs(self.rows.along(self.gradients, v)) <= still
         return np.where(closed, self.rows.drift(x, v), np.inf)
 
     def rest(
@@ -543,21 +534,22 @@ class ConstraintSet:
             return change
         rests = rows.gather(on_walls) > 0.0
         x, v, every, hard = (rows.gather(values) for values in (state.position, state.v, a, mass))
-        values = rows.along(self.jacobian, every) + closed
+        values = rows.along(self.gradients, every) + closed
         largest = self.mesh.comm.allreduce(float(np.abs(every).max(initial=0.0)), op=MPI.MAX)
         place = np.where(rests.any(axis=1), np.arange(len(every)), -1)
         nodes = FreeNodes(every, hard, np.zeros_like(every), at_start=False, free=rows.free)
         with agreed(self.mesh.comm):
             planes = planes_at_rest(contact, rests, (x, v, every), still)
-            system = rows.system(self.jacobian, values, nodes, (place, planes))
+            system = rows.system(self.gradients, values, nodes, place, planes)
             if rows.rubs:
                 squares = np.maximum((rows.weights**2).sum(axis=1, keepdims=True), 1e-300)
-                along = np.einsum("rk,rki->ri", rows.weights, self.jacobian) / squares
+                along = np.einsum("rk,rki->ri", rows.weights, self.gradients) / squares
                 fast = FAST * largest / max(np.abs(v).max(initial=0.0), still)
-                system = system._replace(slips=system.slips + fast * sliding(rows.slips(v), along, still))
+                slips = system.rows.slips
+                slips += fast * sliding(rows.slips(v), along, still)
             pushes = rows.solve(system, 1e-13 * largest, largest)
-        self.force, self.drag = pushes.force, pushes.drag
-        change[rows.here] = (rows.forces(self.jacobian, self.force, self.drag) * rows.free)[rows.mine]
+        self.force, self.drag = pushes.normal, pushes.drag
+        change[rows.here] = (rows.forces(self.gradients, self.force, self.drag) * rows.free)[rows.mine]
         return change
 
     def arrays(self) -> dict[str, tuple[NaturalOrder, np.ndarray]]:

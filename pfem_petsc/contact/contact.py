@@ -13,7 +13,7 @@ from ..integrators.base import Balance, State
 from ..parallel.agreement import agreed
 from ..tolerances import BEYOND, ON_BOUND
 from .explicit import ExplicitContact
-from .frames import MIN_VOLUME, NodalFrames, Planes, RowPlanes, build_frames
+from .frames import MIN_VOLUME, NodalFrames, Planes, RelativeCoordinates, build_frames
 from .node_walls import WallForces, held_by_supports
 from .surfaces import OTHER
 from .tied import FreshTies
@@ -53,24 +53,32 @@ class Contact(ExplicitContact):
         return self.ties.take(walls.nodes, walls.touching, walls.places, time)
 
     def frames(
-        self, candidates: Candidates, x: np.ndarray, balance: Balance, rows: RowPlanes, least: float = MIN_VOLUME
+        self,
+        candidates: Candidates,
+        x: np.ndarray,
+        balance: Balance,
+        slots: int,
+        relative: RelativeCoordinates | None,
+        least: float = MIN_VOLUME,
     ) -> NodalFrames:
         """Build coordinates and bounds of candidates from their planes at positions (owned, 3). Collective.
 
-        ``rows``: further planes of the candidates; ``least``: see :func:`~pfem_petsc.contact.frames.build_frames`.
+        ``slots`` : of walls and of tables of rows; ``relative`` : coordinates of the latter, None if they have none;
+        ``least`` : see :func:`~pfem_petsc.contact.frames.build_frames`.
         """
         nodes, poses, tolerance = candidates.nodes, self.motion.poses(balance.time), ON_BOUND * self.size
-        at = x[nodes]
-        self.find_faces(nodes, at, poses, tolerance)
-        acting = self.acting(nodes, at, poses, balance.acting)
-        normals, offsets = self.planes(candidates.applicable, at, poses, acting, nodes)
-        walls = offsets.shape[1]
-        normals = np.concatenate([normals, rows.normals], axis=1)
-        offsets = np.concatenate([offsets, rows.offsets], axis=1)
-        rank = np.einsum("iwk,ik->iw", normals, rows.places) - offsets
+        places, walls = x[nodes], len(self.wall_of)
+        self.find_faces(nodes, places, poses, tolerance)
+        acting = self.acting(nodes, places, poses, balance.acting)
+        normals, offsets = np.zeros((len(nodes), slots, 3)), np.full((len(nodes), slots), -np.inf)
+        normals[:, :walls], offsets[:, :walls] = self.planes(candidates.applicable, places, poses, acting, nodes)
+        if relative is not None:
+            places = relative.positions(x)[nodes]
+            relative.put_planes(x, nodes, normals[:, walls:], offsets[:, walls:])
+        rank = np.einsum("iwk,ik->iw", normals, places) - offsets
         if candidates.priority is not None:
             rank[:, :walls] = candidates.priority
-        frames = build_frames(nodes, Planes(self.fixed[nodes], normals, offsets, rank, rows.places), tolerance, least)
+        frames = build_frames(nodes, Planes(self.fixed[nodes], normals, offsets, rank, places), tolerance, least)
         with agreed(self.mesh.comm):
             if frames.contradiction >= 0:
                 node = frames.contradiction

@@ -17,8 +17,8 @@ from ..tolerances import FIXED_POINT, PROJECTED, RANK
 from .friction import jam
 from .node_walls import TURN, NodeWalls, WallForces
 from .projection import INFEASIBLE, JAMMED, NodesAtPlanes, Planes, new_pressed, press
-from .rotations import across
-from .surfaces import OTHER, Surfaces, is_round, tangent
+from .rotations import NOWHERE, across, add_to, along, cross, dot, free_components, minus, put, vector
+from .surfaces import OTHER, Surfaces, beyond, is_round, tangent
 from .tied import Ties
 
 if TYPE_CHECKING:
@@ -129,42 +129,30 @@ def find_penetrating(free, walls, marked):
 @inlined
 def _any_beyond(xs, ys, zs, first, last, surfaces):
     """Return whether any of consecutive nodes is beyond a wall, to whichever nodes it applies."""
-    normals, offsets, radii = surfaces.normals, surfaces.offsets, surfaces.radii
-    centres, axes = surfaces.centres, surfaces.axes
-    beyond = 0
-    for k in range(len(radii)):  # without branches
-        if radii[k] == 0.0:
-            nx, ny, nz, offset = normals[k, 0], normals[k, 1], normals[k, 2], offsets[k]
+    found = 0
+    for k in range(len(surfaces.radii)):  # over nodes without branches and roots
+        normal, offset, radius = vector(surfaces.normals, k), surfaces.offsets[k], surfaces.radii[k]
+        if radius == 0.0:
             for i in range(first, last):
-                gap = -offset + nx * xs[i] + ny * ys[i] + nz * zs[i]
-                beyond += 1 if gap < 0.0 else 0
-            continue
-        if not is_round(radii[k]):
-            continue
-        # without roots
-        cx, cy, cz, ax, ay, az = centres[k, 0], centres[k, 1], centres[k, 2], axes[k, 0], axes[k, 1], axes[k, 2]
-        side = 1.0 if radii[k] > 0.0 else -1.0
-        limit = radii[k] * radii[k] * (1.0 + side * _ROOT)
-        for i in range(first, last):
-            x, y, z = xs[i] - cx, ys[i] - cy, zs[i] - cz
-            along = x * ax + y * ay + z * az
-            x -= along * ax
-            y -= along * ay
-            z -= along * az
-            beyond += 1 if side * (x * x + y * y + z * z - limit) < 0.0 else 0
-    return beyond > 0
+                found += 1 if beyond(normal, offset, (xs[i], ys[i], zs[i])) < 0.0 else 0
+        elif is_round(radius):
+            centre, axis, side = vector(surfaces.centres, k), vector(surfaces.axes, k), 1.0 if radius > 0.0 else -1.0
+            limit = radius * radius * (1.0 + side * _ROOT)
+            for i in range(first, last):
+                arm = minus((xs[i], ys[i], zs[i]), centre)
+                arm = along(arm, -dot(arm, axis), axis)
+                found += 1 if side * (dot(arm, arm) - limit) < 0.0 else 0
+    return found > 0
 
 
 @inlined
 def _list_penetrating(free, first, last, walls, returning, m):
     """Append those of consecutive nodes that are beyond a wall that applies to them, or rebound, to the ``m`` found."""
     surfaces, all_nodes, members = walls.surfaces, walls.all_nodes, walls.members
-    radii = surfaces.radii
     for i in range(first, last):
-        for k in range(len(radii)):
-            gap = 0.0
-            if radii[k] != OTHER:
-                _, _, _, gap = tangent(k, surfaces, free[0, i], free[1, i], free[2, i])
+        place = free[0, i], free[1, i], free[2, i]
+        for k in range(len(surfaces.radii)):
+            gap = tangent(k, surfaces, place)[1] if surfaces.radii[k] != OTHER else 0.0
             if (gap < 0.0 and (all_nodes[k] or members[i, k])) or (returning and walls.rebound[i, k] > 0.0):
                 walls.room[m] = i
                 m += 1
@@ -217,42 +205,35 @@ def rebound_lift(restitution: Any, square: Any, arrival: Any, pull: Any) -> Any:
 def _acting(j, k, normal, walls, given):
     """Return the direction in which a round wall pushes the j-th node, see
     :meth:`~pfem_petsc.contact.node_walls.NodeWalls.acting`; ``normal`` is the one where it ends."""
-    surfaces, part, start, ways, free = walls.surfaces, walls.part, given.start, given.ways, given.free
-    bx, by, bz = start[j, 0] + ways[j, k, 0], start[j, 1] + ways[j, k, 1], start[j, 2] + ways[j, k, 2]
-    there = bx + part * (free[j, 0] - bx), by + part * (free[j, 1] - by), bz + part * (free[j, 2] - bz)
-    nx, ny, nz, _ = tangent(k, surfaces, there[0], there[1], there[2])
-    ex, ey, ez, _ = tangent(k, surfaces, free[j, 0], free[j, 1], free[j, 2])
-    return (nx, ny, nz) if part < 1.0 and nx * ex + ny * ey + nz * ez > TURN else normal
+    end, start = vector(given.free, j), along(vector(given.start, j), 1.0, vector(given.ways[j], k))
+    there, _ = tangent(k, walls.surfaces, along(start, walls.part, minus(end, start)))
+    ending, _ = tangent(k, walls.surfaces, end)
+    return there if walls.part < 1.0 and dot(there, ending) > TURN else normal
 
 
 @inlined
 def _set_planes(j, at, pushed, walls, given, planes, pulls):
     """Set the planes of the j-th node at positions ``at`` (m, 3), and the ``pulls`` (m, w) of forces towards walls with
     restitution [m], by which it would move to ``pushed`` (m, 3) without walls."""
-    surfaces, restitution, start, free = walls.surfaces, walls.restitution, given.start, given.free
-    x, y, z = at[j, 0], at[j, 1], at[j, 2]
+    surfaces, restitution, place = walls.surfaces, walls.restitution, vector(at, j)
+    start, free = vector(given.start, j), vector(given.free, j)
     for k in range(planes.gaps.shape[1]):
         if surfaces.radii[k] == OTHER:
-            n, gap = (given.normals[j, k, 0], given.normals[j, k, 1], given.normals[j, k, 2]), -given.offsets[j, k]
-            gap += n[0] * x + n[1] * y + n[2] * z
+            normal = vector(given.normals[j], k)
+            gap = beyond(normal, given.offsets[j, k], place)
         else:
-            nx, ny, nz, gap = tangent(k, surfaces, x, y, z)
-            n = (nx, ny, nz)
+            normal, gap = tangent(k, surfaces, place)
             if surfaces.radii[k] != 0.0:
-                n = _acting(j, k, n, walls, given)
-        gap += n[0] * (free[j, 0] - x) + n[1] * (free[j, 1] - y) + n[2] * (free[j, 2] - z)
-        planes.normals[j, k, 0], planes.normals[j, k, 1], planes.normals[j, k, 2] = n
+                normal = _acting(j, k, normal, walls, given)
+        gap += dot(normal, minus(free, place))
+        put(planes.normals[j], k, normal)
         if len(restitution) > 0:
-            pull = 0.0
-            for c in range(3):
-                pull -= planes.normals[j, k, c] * (pushed[j, c] - start[j, c] - given.drift[j, c])
-            pulls[j, k] = pull
-            gap -= rebound_lift(restitution[k], given.rebound[j, k], given.arrival[j, k], pull)
+            pulls[j, k] = -dot(normal, minus(minus(vector(pushed, j), start), vector(given.drift, j)))
+            gap -= rebound_lift(restitution[k], given.rebound[j, k], given.arrival[j, k], pulls[j, k])
         planes.gaps[j, k] = gap if given.applies[j, k] else math.inf
         if len(planes.friction) > 0:
             planes.friction[j, k, 0], planes.friction[j, k, 1] = walls.friction[0, k], walls.friction[1, k]
-            for c in range(3):
-                planes.slips[j, k, c] = free[j, c] - start[j, c] - given.ways[j, k, c]
+            put(planes.slips[j], k, minus(minus(free, start), vector(given.ways[j], k)))
 
 
 @inlined
@@ -261,7 +242,7 @@ def _meets_round(j, found, walls, given):
     surfaces, bounces = walls.surfaces, len(walls.restitution) > 0
     for k in range(found.normal.shape[1]):
         if is_round(surfaces.radii[k]) and given.applies[j, k]:
-            _, _, _, gap = tangent(k, surfaces, found.x[j, 0], found.x[j, 1], found.x[j, 2])
+            _, gap = tangent(k, surfaces, vector(found.x, j))
             if found.normal[j, k] > 0.0 or gap < 0.0 or (bounces and given.rebound[j, k] > 0.0):
                 return True
     return False
@@ -269,30 +250,25 @@ def _meets_round(j, found, walls, given):
 
 @inlined
 def _settle(j, at, nodes, found, walls, given, pulls):
-    """Press the j-th of :class:`NodesAtPlanes` again, whose planes were those at ``at`` (3,), until planes of round
-    walls and position agree. Returns why it has no place, or 0.
+    """Press the j-th of :class:`NodesAtPlanes` again, whose planes were those at ``at`` (m, 3), until planes
+    of round walls and position agree. Returns why it has no place, or 0.
 
     With friction, the positions of planes are those of Aitken's relaxation: in large steps, those of friction alone
     alternate or creep.
     """
-    x, last, part, rubs = found.x[j], np.zeros(3), 1.0, len(nodes.planes.friction) > 0
+    last, part, rubs = NOWHERE, 1.0, len(nodes.planes.friction) > 0
     for _ in range(_CURVED_ROUNDS):
         if not _meets_round(j, found, walls, given):
             return 0
-        along = square = largest = 0.0
-        for c in range(3):
-            change = x[c] - at[c] - last[c]
-            along -= last[c] * change
-            square += change * change
-            last[c] += change
-            largest = max(largest, abs(last[c]))
-        if largest <= walls.tolerance:
+        before, last = last, minus(vector(found.x, j), vector(at, j))
+        if max(abs(last[0]), abs(last[1]), abs(last[2])) <= walls.tolerance:
             return 0
-        if rubs and along != 0.0:
-            part = min(max(part * along / square, _LEAST_PART), _LARGEST_PART) if along > 0.0 else 0.5
-        for c in range(3):
-            at[c] += part * last[c]
-            x[c] = at[c]
+        change = minus(last, before)
+        less = -dot(before, change)
+        if rubs and less != 0.0:
+            part = min(max(part * less / dot(change, change), _LEAST_PART), _LARGEST_PART) if less > 0.0 else 0.5
+        add_to(at, j, part, last)
+        put(found.x, j, vector(at, j))
         _set_planes(j, found.x, given.free, walls, given, nodes.planes, pulls)
         _, why = press((j, j + 1), nodes, walls.tolerance, found, NEEDED)
         if why > 0:
@@ -308,7 +284,7 @@ def _press_all(nodes, found, walls, given, pulls, curved, several):
     failed, why = press((0, len(at)), nodes, walls.tolerance, found, several)
     if curved is not None:
         for j in range(len(at)):
-            wrong = why if j == failed else _settle(j, at[j], nodes, found, walls, given, pulls)
+            wrong = why if j == failed else _settle(j, at, nodes, found, walls, given, pulls)
             if wrong > 0 and (failed < 0 or j < failed):
                 failed, why = j, wrong
     return failed, why
@@ -320,11 +296,9 @@ def _remember(found, planes, pulls, walls, given):
     for j in range(len(found.x)):
         for k in range(len(walls.restitution)):
             fresh = found.normal[j, k] > 0.0 and not given.touching[j, k] and walls.restitution[k] > 0.0
-            approach = arrived = 0.0
-            for c in range(3):
-                way = given.start[j, c] + given.ways[j, k, c]
-                approach -= planes.normals[j, k, c] * (given.free[j, c] - way + walls.pushed[k, c])
-                arrived -= planes.normals[j, k, c] * (found.x[j, c] - way)
+            normal, start = vector(planes.normals[j], k), along(vector(given.start, j), 1.0, vector(given.ways[j], k))
+            approach = -dot(normal, along(minus(vector(given.free, j), start), 1.0, vector(walls.pushed, k)))
+            arrived = -dot(normal, minus(vector(found.x, j), start))
             given.rebound[j, k] = impact_square(approach, arrived, pulls[j, k]) if fresh else 0.0
             given.arrival[j, k] = arrived if fresh else 0.0
 
@@ -374,29 +348,22 @@ def press_nodes(given, walls, sums, curved, rough, several):
     if rough is not None:  # noqa: SIM102 - what is not needed is not compiled
         if failed < 0:
             failed, why = _press_all(NodesAtPlanes(*of_nodes, planes), found, walls, given, pulls, curved, several)
-    total, touching, arm, dissipated = np.zeros((m, 3)), np.zeros((m, w), dtype=np.bool_), np.empty(3), 0.0
-    drag = found.drag
+    total, touching, dissipated = np.zeros((m, 3)), np.zeros((m, w), dtype=np.bool_), 0.0
     for j in range(m):
-        for c in range(3):  # where the forces of the balance act
-            arm[c] = start[j, c] + walls.part * (found.x[j, c] - start[j, c])
+        way = minus(vector(found.x, j), vector(start, j))
+        acts, last = along(vector(start, j), walls.part, way), -1  # where the forces of the balance do
         for k in range(w):
-            strength, wall = found.normal[j, k], wall_of[k]
-            if strength == 0.0:
+            if found.normal[j, k] == 0.0:
                 continue
-            touching[j, k] = True
-            sums.contacts[wall] += 1
-            for earlier in range(k):  # a node in several slots of a wall counts once
-                if wall_of[earlier] == wall and touching[j, earlier]:
-                    sums.contacts[wall] -= 1
-                    break
-            for c in range(3):
-                force = strength * normals[j, k, c] + drag[j, k, c]
-                dissipated -= drag[j, k, c] * (found.x[j, c] - start[j, c] - ways[j, k, c])
-                total[j, c] += force
-                sums.force[wall, c] += force
-                one, other = (c + 1) % 3, (c + 2) % 3
-                sums.moment[wall, one] += arm[other] * force
-                sums.moment[wall, other] -= arm[one] * force
+            touching[j, k], wall = True, wall_of[k]
+            sums.contacts[wall] += 1 if wall != last else 0  # a node in several slots of a wall counts once
+            last = wall
+            drag = vector(found.drag[j], k)
+            dissipated -= dot(drag, minus(way, vector(ways[j], k)))
+            force = along(drag, found.normal[j, k], vector(normals[j], k))
+            add_to(total, j, 1.0, force)
+            add_to(sums.force, wall, 1.0, force)
+            add_to(sums.moment, wall, 1.0, cross(acts, force))
     return failed, why, found, total, touching, dissipated
 
 
@@ -441,8 +408,7 @@ def _slope_of_plane(j, k, weight, normal, given, held, walls):
             slip[:] = 0.0
         slope -= rough * weight * np.outer(slip, normal)
         across_slip = np.eye(3) - np.outer(normal, normal) - np.outer(slip, slip)
-        for c in range(3):
-            slope[c] += (0.0 if held.fixed[j, c] else held.stiffness[j] * turning) * across_slip[c]
+        slope += np.where(held.fixed[j], 0.0, held.stiffness[j] * turning).reshape(3, 1) * across_slip
     return slope
 
 
@@ -455,28 +421,23 @@ def slopes_of_walls(given, held, walls, levers):
     """
     normals = planes_of(held.places[: len(given.free)], given.free, given, walls)[0].normals
     total, w = np.zeros((levers.pivots.shape[1], 6, 6)), held.touching.shape[1]
-    rows, weights, whole = np.zeros((w, 3)), np.empty(w), np.empty((3, 6))
+    rows, whole = np.zeros((w, 3)), np.empty((3, 6))
     for j in range(len(held.places)):
-        count, stiffness, tied = 0, held.stiffness[j], j >= len(normals)
+        tied = j >= len(normals)
         for k in range(w):
-            if held.touching[j, k]:
-                for c in range(3):
-                    rows[count, c] = 0.0 if held.fixed[j, c] or tied else normals[j, k, c]
-                count += 1
-        inverse = np.linalg.pinv(rows[: max(count, 1)].copy(), RANK)
-        for k in range(count):  # the diagonal of k (N N^T)^-1
-            weights[k] = stiffness * (inverse[0, k] ** 2 + inverse[1, k] ** 2 + inverse[2, k] ** 2)
-        count = 0
+            free = NOWHERE
+            if held.touching[j, k] and not tied:
+                free = free_components(vector(normals[j], k), held.fixed[j])
+            put(rows, k, free)
+        inverse = np.linalg.pinv(rows, RANK)
         for k in range(w):
-            if not held.touching[j, k]:
+            i = levers.body[k]
+            if not held.touching[j, k] or i < 0:
                 continue
-            count, i = count + 1, levers.body[k]
-            if i < 0:
-                continue
-            if tied:
-                slope = np.diag(np.where(held.fixed[j], 0.0, stiffness))
-            else:
-                slope = _slope_of_plane(j, k, weights[count - 1], normals[j, k].copy(), given, held, walls)
+            slope = np.diag(np.where(held.fixed[j], 0.0, held.stiffness[j]))
+            if not tied:
+                weight = held.stiffness[j] * (inverse[:, k] ** 2).sum()  # of the diagonal of k (N N^T)^-1
+                slope = _slope_of_plane(j, k, weight, normals[j, k].copy(), given, held, walls)
             arms = np.stack((held.acts[j] - levers.pivots[0, i], held.places[j] - levers.pivots[1, i]))
             lever = across(arms)
             whole[:, :3], whole[:, 3:] = slope, -(slope @ lever[1])
@@ -490,11 +451,9 @@ class OutOfReachError(Exception):
 
 
 class Stopped(NamedTuple):
-    """Nodes (m,) that walls stop: positions and forces (m, 3) [m], [N], WallForces, and the Arrivals of those that are
-    not tied; None for none."""
+    """Nodes (m,) that walls stop: forces (m, 3) on them [N], WallForces, and the Arrivals of those that are not tied;
+    None for none."""
 
-    nodes: np.ndarray
-    places: np.ndarray
     force: np.ndarray
     walls: WallForces
     given: Arrivals | None
@@ -568,12 +527,12 @@ class ExplicitContact(NodeWalls):
                 found = self.project(x, stiffness, time)
             else:
                 found = self.push_walls(lambda: x, stiffness, pushing)
-            nodes, places, force, walls, _ = self.book(found, time)
+            force, walls, _ = self.book(found, time)
         except SimulationFailure:  # until other ranks know of it, the other nodes stay at walls
             u[:] = x - predictor
             raise
-        u[nodes] += places - x[nodes]
-        return nodes, force, walls
+        u[walls.nodes] += walls.places - x[walls.nodes]
+        return walls.nodes, force, walls
 
     def placeless(self, node: int, why: int, x: np.ndarray, time: float) -> str:
         """Return the message about an owned node whose place near x (3,) at a time [s] :func:`press_nodes` did not
@@ -583,18 +542,13 @@ class ExplicitContact(NodeWalls):
         if why == INFEASIBLE:
             return self.infeasible_message(node, offsets[0])
         if why == JAMMED:
-            return self.unsettled_friction(node, normals[0])
+            return jam(self, node, normals[0]) or (
+                f"the friction of node {self.mesh.node_ids[node]} on its walls did not converge; reduce time.step"
+            )
         return (
             f"the position of node {self.mesh.node_ids[node]} on curved walls did not converge in {_CURVED_ROUNDS} "
             "iterations: walls and supports may be infeasible together; move the walls apart, free the node, or "
             "reduce time.step"
-        )
-
-    def unsettled_friction(self, node: int, normals: np.ndarray) -> str:
-        """Return the message about an owned node without a solution of its friction at walls with ``normals`` (w,
-        3)."""
-        return jam(self, node, normals) or (
-            f"the friction of node {self.mesh.node_ids[node]} on its walls did not converge; reduce time.step"
         )
 
     def walls_at(self, poses: Poses, part: float) -> Any:
@@ -632,8 +586,8 @@ class ExplicitContact(NodeWalls):
         coupled: bool = False,
         some: tuple[np.ndarray, np.ndarray] | None = None,
     ) -> Stopped:
-        """Find the final positions of walls with mass in an explicit step; return the nodes that walls stop then, which
-        :meth:`book` is to be told. Collective.
+        """Find the final positions of walls with mass, if any, in an explicit step; return the nodes that walls stop
+        then, which :meth:`book` is to be told. Collective.
 
         Parameters
         ----------
@@ -649,22 +603,18 @@ class ExplicitContact(NodeWalls):
         """
         bodies, time, self._part = self.motion.bodies, balance.time, balance.acting
         failure: SimulationFailure | None = None
-        chosen, sought, first, found = some, None, True, None
+        sought, first, found = None, True, None
 
         def forces() -> tuple[np.ndarray, Callable[[], np.ndarray] | None]:
-            nonlocal failure, chosen, sought, first, found
+            nonlocal failure, sought, first, found
             fresh, first = first, False
             try:
                 x = place()
-                if sought is None or bodies.strays(sought, self.limits):
-                    if sought is not None:
-                        self.limits *= 2.0
-                    if some is not None and sought is not None:
-                        raise OutOfReachError
-                    sought = bodies.way
-                    # coupled nodes may be anywhere in the next trial
-                    chosen = self._near_bodies(x, time) if some is None and not coupled else some
-                found = self.project(x, stiffness, time, chosen)
+                sought = bodies.way if sought is None else sought
+                if some is not None and bodies.strays(sought, self.limits):
+                    self.limits *= 2.0
+                    raise OutOfReachError
+                found = self.project(x, stiffness, time, some)
             except SimulationFailure as met:  # raised once all ranks have left the iteration
                 failure = failure or met
                 return np.zeros((2, len(bodies.at), 3)), lambda: np.zeros((len(bodies.at), 6, 6))
@@ -679,19 +629,9 @@ class ExplicitContact(NodeWalls):
             raise SimulationFailure(self.unsettled_message())
         return found
 
-    def _near_bodies(self, x: np.ndarray, time: float) -> tuple[np.ndarray, np.ndarray]:
-        """Return the nodes that rebound, and those that walls may meet at a time [s] which move as far as is assumed,
-        of nodes at (owned, 3)."""
-        arms = np.zeros(len(x))
-        for pivot in self.motion.bodies.pivots(1.0):
-            np.maximum(arms, ((x - pivot) ** 2).sum(axis=1), out=arms)
-        reach = self.limits[0] + self.limits[1] * np.sqrt(arms)
-        near = np.flatnonzero(self.near(x, self.motion.poses(time), reach))
-        return np.flatnonzero((self._memory[0] > 0.0).any(axis=1)) if self.rebounds else near[:0], near
-
     def _slopes(self, found: Stopped, stiffness: np.ndarray, time: float) -> np.ndarray:
         """Return this rank's share of the derivatives of :func:`slopes_of_walls`."""
-        bodies, nodes, places, given = self.motion.bodies, found.nodes, found.places, found.given
+        bodies, nodes, places, given = self.motion.bodies, found.walls.nodes, found.walls.places, found.given
         if not len(nodes):
             return np.zeros((len(bodies.at), 6, 6))
         body = np.full(len(self.walls), -1)
@@ -767,15 +707,14 @@ class ExplicitContact(NodeWalls):
         own[np.arange(len(tied)), self.first[walls]] = True
         start = places if self.state is None else self.state.position[tied]
         held = self.sums(tied, every, (places, start + self._part * (places - start)), own)
-        nodes, moved = np.append(found.nodes, tied), np.vstack([found.places, places])
         sums = WallForces(
             *(getattr(sums, name) + getattr(held, name) for name in WallForces.sums),
-            nodes,
+            np.append(sums.nodes, tied),
             np.vstack([sums.touching, own]),
-            moved,
+            np.vstack([sums.places, places]),
             sums.friction,
         )
-        return Stopped(nodes, moved, np.vstack([found.force, pull]), sums, found.given)
+        return Stopped(np.vstack([found.force, pull]), sums, found.given)
 
     def press_some(
         self,
@@ -789,10 +728,7 @@ class ExplicitContact(NodeWalls):
 
         ``x`` (owned, 3), ``stiffness`` (owned,) : of these nodes, see :meth:`explicit`; ``balance`` : of the step
         """
-        self._part = balance.acting
-        if self.motion.bodies.any:
-            return self.book(self.push_walls(lambda: x, stiffness, balance, some=some), balance.time)
-        return self.book(self.project(x, stiffness, balance.time, some), balance.time)
+        return self.book(self.push_walls(lambda: x, stiffness, balance, some=some), balance.time)
 
     def _press_some(
         self,
@@ -805,7 +741,7 @@ class ExplicitContact(NodeWalls):
         """Press nodes (m,) that are ``free`` to move to (m, 3), where a failure leaves what is found."""
         w, state = len(self.wall_of), self.state
         if len(nodes) == 0:
-            return Stopped(nodes, np.empty((0, 3)), np.empty((0, 3)), self.nothing, None)
+            return Stopped(np.empty((0, 3)), self.nothing, None)
         before = poses if state is None else self._poses_before()
         bounces, others, at = self.rebounds, not self.known.all(), free
         start, drift = free if state is None else state.position[nodes], np.zeros_like(free)
@@ -836,16 +772,16 @@ class ExplicitContact(NodeWalls):
         if failed >= 0:
             free[:] = places
             raise SimulationFailure(self.placeless(nodes[failed], why, places[failed], poses.time))
-        return Stopped(nodes, places, force, WallForces(*sums, nodes, touching, places, friction), given)
+        return Stopped(force, WallForces(*sums, nodes, touching, places, friction), given)
 
     def book(self, found: Stopped, time: float) -> Stopped:
         """Keep the memory of the nodes that walls stop at the end of a step, at a time [s]; return them."""
         given = found.given
         if not self.rebounds or given is None:
             return found
-        nodes = found.nodes[: len(given.free)]
+        nodes = found.walls.nodes[: len(given.free)]
         if len(self.motion.bodies.turners):
-            poses, places = self.motion.poses(time), found.places[: len(nodes)]
+            poses, places = self.motion.poses(time), found.walls.places[: len(nodes)]
             unpushed = self.ways(given.start, self._poses_before(), self.motion.poses_without_contact(time))
             planes, _ = planes_of(places, given.free, given, self.walls_at(poses, self._part))
             self._set_rebounds(given, planes.normals, unpushed)

@@ -2,32 +2,10 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import numpy as np
 
-from ..mechanics.compiled import kernel
 from ..mesh.exchange import swap
 from .rows import RowSet
-
-
-class ClosingRows(NamedTuple):
-    """Rows (p,) n . (x_2 - x_1) >= least that may close.
-
-    Attributes
-    ----------
-    normals, least : (p, 3) unit directions; (p,) bounds [m]
-    along : (2, p) squared lengths of the free parts of the directions
-    force : (p,) on the second nodes [N]; closed : (p,) bool, rows that have closed and not opened since
-    restitution : (p,) coefficients
-    """
-
-    normals: np.ndarray
-    least: np.ndarray
-    along: np.ndarray
-    force: np.ndarray
-    closed: np.ndarray
-    restitution: np.ndarray
 
 
 class TwoNodeRows:
@@ -39,9 +17,10 @@ class TwoNodeRows:
     at : (p,) which rows of the set
     every : whether these are all rows of the set on this rank, no two of them with a common node
     ends, nodes : (2, p) nodes of the rows among those of the set, and their local indices, negative at other ranks
-    normals, least, along : see :class:`ClosingRows`
+    normals, least : (p, 3) unit directions; (p,) bounds [m], of rows n . (x_2 - x_1) >= least
+    along : (2, p) squared lengths of the free parts of the directions
     counted : (p,) bool, rows whose second node this rank owns
-    record : ClosingRows, in the order of the set
+    restitution : (p,) coefficients
     """
 
     def __init__(self, rows: RowSet) -> None:
@@ -60,11 +39,8 @@ class TwoNodeRows:
         if len(self.at):
             self.least = 0.0 - rows.values(np.zeros((len(rows.numbers), 3)))[self.at]
         self._free = rows.free[self.ends]
-        parts = self._free * self.normals**2
-        self.along = (parts[:, :, 0] + parts[:, :, 1]) + parts[:, :, 2]
-        p = len(self.at)
-        changing = np.zeros(p), np.zeros(p, dtype=bool)
-        self.record = ClosingRows(self.normals, self.least, self.along, *changing, rows.restitution[self.at])
+        self.along = (self._free * self.normals**2).sum(axis=2)
+        self.restitution = rows.restitution[self.at]
 
     def agree(self, force: np.ndarray) -> None:
         """Replace forces (r,) of the set's rows, where two ranks have them, by those of the rank of the second node: if
@@ -93,7 +69,7 @@ class TwoNodeRows:
         """Return velocities or accelerations (owned, 3) at which the nodes of rows ``which`` (p,) bool separate at
         ``rates`` (p,), with the same momentum; the rows share no nodes. Collective."""
         ends, masses = self.gather(values), self.gather(mass)
-        gives = (1.0 / masses * self.along).sum(axis=0)
+        gives = (self.along / masses).sum(axis=0)
         force = np.where(which & (gives > 0.0), rates - self.apart(ends), 0.0) / np.maximum(gives, 1e-300)
         end, row = np.nonzero((self.nodes >= 0) & (force != 0.0))
         push = (np.where(end == 1, force[row], -force[row])[:, None] * self.normals[row]) * self._free[end, row]
@@ -106,34 +82,20 @@ class TwoNodeRows:
         gives = (self.along / self.gather(mass)).sum(axis=0)
         return 1.0 / np.maximum(gives, 1e-300)
 
+    def close(self, at: np.ndarray, force: np.ndarray, ends: np.ndarray, slack: float) -> tuple[np.ndarray, float]:
+        """Return which rows are closed (m,), and the energy [J] that those lose which close and whose second nodes this
+        rank owns, see :mod:`~pfem_petsc.stepping.impact`.
 
-@kernel
-def close_rows(rows, at, ends, counted, slack):
-    """Return the energy [J] that closing rows lose, see :mod:`~pfem_petsc.stepping.impact`; update ``rows.closed``.
-
-    Parameters
-    ----------
-    rows : ClosingRows
-    at : (m,) rows whose force begins or ends
-    ends : (2, m, 10) position, velocity and acceleration without contact, and mass of their nodes
-    counted : (p,) bool, rows whose energy this rank counts
-    slack : distance at which a row has opened [m]
-    """
-    normals, along = rows.normals, rows.along
-    energy = 0.0
-    parts = np.empty(3)
-    for m in range(len(at)):
-        p = at[m]
-        for k in range(3):
-            d0 = normals[p, 0] * (ends[1, m, 3 * k] - ends[0, m, 3 * k])
-            d1 = normals[p, 1] * (ends[1, m, 3 * k + 1] - ends[0, m, 3 * k + 1])
-            d2 = normals[p, 2] * (ends[1, m, 3 * k + 2] - ends[0, m, 3 * k + 2])
-            parts[k] = (d0 + d2) + d1
-        distance, speed, pull = parts[0] - rows.least[p], parts[1], parts[2]
-        fresh = rows.force[p] > 0.0
-        rows.closed[p] = fresh or distance <= slack
-        if fresh and speed < 0.0 and counted[p]:
-            square = max(speed * speed - 2.0 * pull * max(distance, 0.0), 0.0)
-            gives = along[0, p] / ends[0, m, 9] + along[1, p] / ends[1, m, 9]
-            energy += 0.5 * square / max(gives, 1e-300) * (1.0 - rows.restitution[p] * rows.restitution[p])
-    return energy
+        Parameters
+        ----------
+        at : (m,) rows whose force begins or ends; force : (m,) theirs
+        ends : (2, m, 10) position, velocity and acceleration without contact, and mass of their nodes
+        slack : distance at which a row has opened [m]
+        """
+        apart = (ends[1] - ends[0])[:, :9].reshape(-1, 3, 3)
+        distance, speed, pull = np.einsum("mi,mki->km", self.normals[at], apart)
+        distance, fresh = distance - self.least[at], force > 0.0
+        square = np.maximum(speed * speed - 2.0 * pull * np.maximum(distance, 0.0), 0.0)
+        gives = (self.along[:, at] / ends[:, :, 9]).sum(axis=0)
+        lost = 0.5 * square / np.maximum(gives, 1e-300) * (1.0 - self.restitution[at] ** 2)
+        return fresh | (distance <= slack), float(lost[fresh & (speed < 0.0) & self.counted[at]].sum())

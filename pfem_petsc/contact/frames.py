@@ -5,14 +5,14 @@ slipping nodes, and relative coordinates of the nodes of rows.
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, NamedTuple, Self
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from mpi4py import MPI
 
 from ..mechanics.compiled import inlined, kernel
 from ..tolerances import FREE_PART
-from .rotations import along, cross, dot, free_components, minus, put, times, vector
+from .rotations import along, dot, free_components, put, times, vector
 
 if TYPE_CHECKING:
     from .rows import Alike, RowSet
@@ -116,20 +116,13 @@ class NodalFrames:
 
     def __init__(self, nodes: np.ndarray, walls: int) -> None:
         m = len(nodes)
-        self.nodes = nodes
-        self.places = np.zeros((m, 3))
-        self.basis = np.zeros((m, 3, 3))
-        self.inverse = np.zeros((m, 3, 3))
-        self.lower = np.full((m, 3), -np.inf)
-        self.upper = np.full((m, 3), np.inf)
-        self.rows = np.full((m, walls), -1, dtype=np.int8)
-        self.ratios = np.ones((m, walls))
-        self.shared = np.zeros((m, walls), dtype=np.bool_)
-        self.bounds = np.zeros((m, walls))
-        self.normals = np.zeros((m, walls, 3))
-        self.offsets = np.full((m, walls), -np.inf)
-        self.oblique = False
-        self.contradiction = -1
+        self.nodes, self.places = nodes, np.zeros((m, 3))
+        self.basis, self.inverse = np.zeros((2, m, 3, 3))
+        self.lower, self.upper = np.full((m, 3), -np.inf), np.full((m, 3), np.inf)
+        self.rows, self.shared = np.full((m, walls), -1, dtype=np.int8), np.zeros((m, walls), dtype=np.bool_)
+        self.ratios, self.bounds = np.ones((m, walls)), np.zeros((m, walls))
+        self.normals, self.offsets = np.zeros((m, walls, 3)), np.full((m, walls), -np.inf)
+        self.oblique, self.contradiction = False, -1
         none, vectors = np.zeros((0, walls)), np.zeros((0, walls, 3))
         self.sliding = Sliding(self, nodes[:0], SlipForces(np.zeros((0, 3)), none, vectors, vectors, np.zeros(0)))
 
@@ -155,25 +148,6 @@ class Planes(NamedTuple):
     offsets: np.ndarray
     rank: np.ndarray
     places: np.ndarray
-
-
-class RowPlanes(NamedTuple):
-    """Rows as planes n . y >= d of nodes (m,), with one slot for each table (t,).
-
-    Attributes
-    ----------
-    places : (m, 3) y [m], the positions of nodes without rows
-    normals, offsets : (m, t, 3), (m, t) [m]; offsets -inf where a table has no row
-    """
-
-    places: np.ndarray
-    normals: np.ndarray
-    offsets: np.ndarray
-
-    @classmethod
-    def none(cls, places: np.ndarray, tables: int) -> Self:
-        """Return the planes of no rows."""
-        return cls(places, np.zeros((len(places), tables, 3)), np.full((len(places), tables), -np.inf))
 
 
 def pivots(matrices: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
@@ -321,21 +295,18 @@ class RelativeCoordinates:
         total[self.nodes] = np.where(soft > 0.0, 1.0 / np.maximum(soft, 1e-300), k[self.nodes])
         return total
 
-    def planes(self, x: np.ndarray, nodes: np.ndarray) -> RowPlanes:
-        """Return the rows with carriers at positions (owned, 3) as planes of owned nodes (k,), ascending, which include
-        the carriers. Collective."""
-        rows, every, at, tables = self.rows, self.rows.gather(x), self._placed, len(self.friction)
-        planes = RowPlanes.none(self.positions(x)[nodes], tables)
-        if len(at):
-            place, table = np.searchsorted(nodes, self.nodes)[self._place], rows.source[at]
-            end = np.abs(rows.weights[at]).argmax(axis=1)
-            n = rows.fixed_jacobian[at, end] / rows.weights[at, end][:, None]
-            planes.normals[place, table] = n
-            planes.offsets[place, table] = np.einsum("ri,ri->r", n, rows.slips(every)[at]) - rows.values(every)[at]
-        return planes
+    def put_planes(self, x: np.ndarray, nodes: np.ndarray, normals: np.ndarray, offsets: np.ndarray) -> None:
+        """Write the rows with carriers at positions (owned, 3) as planes n . y >= d of owned nodes (k,), ascending,
+        with the carriers among them: normals (k, tables, 3) and offsets (k, tables) [m]. Collective."""
+        rows, every, at = self.rows, self.rows.gather(x), self._placed
+        place, table = np.searchsorted(nodes, self.nodes)[self._place], rows.source[at]
+        end = np.abs(rows.weights[at]).argmax(axis=1)
+        n = rows.fixed_jacobian[at, end] / rows.weights[at, end][:, None]
+        normals[place, table] = n
+        offsets[place, table] = np.einsum("ri,ri->r", n, rows.slips(every)[at]) - rows.values(every)[at]
 
 
-_FILLED = "basis", "inverse", "lower", "upper", "rows", "ratios", "shared", "bounds"
+_FILLED = "basis", "lower", "upper", "rows", "ratios", "shared", "bounds"
 
 
 def build_frames(nodes: np.ndarray, planes: Planes, tolerance: float = 0.0, least: float = MIN_VOLUME) -> NodalFrames:
@@ -350,8 +321,13 @@ def build_frames(nodes: np.ndarray, planes: Planes, tolerance: float = 0.0, leas
     """
     frames = NodalFrames(nodes, planes.offsets.shape[1])
     frames.places, frames.normals = planes.places, planes.normals
-    output = tuple(getattr(frames, name) for name in _FILLED)
-    frames.oblique, frames.contradiction = _build(planes, tolerance, least, output)
+    lower, upper = frames.lower, frames.upper
+    order = np.argsort(planes.rank, axis=1, kind="stable")
+    _build(planes, order, least, tuple(getattr(frames, name) for name in _FILLED))
+    frames.inverse, frames.oblique = np.linalg.inv(frames.basis), bool((frames.basis != _AXES).any())
+    infeasible, crossed = np.flatnonzero((lower > upper + tolerance).any(axis=1)), lower > upper
+    frames.contradiction = int(infeasible[0]) if len(infeasible) else -1
+    lower[crossed] = upper[crossed] = 0.5 * (lower[crossed] + upper[crossed])
     frames.offsets = np.where(frames.rows >= 0, planes.offsets, -np.inf)
     return frames
 
@@ -384,15 +360,12 @@ def _complete(basis, taken, spanned, n):
 
 
 @kernel
-def _build(planes, tolerance, least, output):
-    """Fill the arrays of :class:`NodalFrames` that ``_FILLED`` names; return whether any basis is not the identity, and
-    a node with infeasible bounds, else -1."""
-    fixed, normals, offsets, rank, places = planes
-    basis, inverse, lower, upper, rows, ratios, shares, bounds = output
-    m, w = offsets.shape
-    taken, done, spanned = np.zeros(3, dtype=np.bool_), np.zeros(w, dtype=np.bool_), np.zeros((3, 3))
-    oblique, contradiction = False, -1
-    for i in range(m):
+def _build(planes, order, least, output):
+    """Fill the arrays of :class:`NodalFrames` that ``_FILLED`` names; ``order`` (m, w): of the walls at each node."""
+    fixed, normals, offsets, _, places = planes
+    basis, lower, upper, rows, ratios, shares, bounds = output
+    taken, spanned = np.zeros(3, dtype=np.bool_), np.zeros((3, 3))
+    for i in range(len(order)):
         n, volume, own = 0, 1.0, basis[i]
         for c in range(3):
             taken[c] = fixed[i, c]
@@ -400,16 +373,9 @@ def _build(planes, tolerance, least, output):
                 put(own, c, vector(_AXES, c))
                 put(spanned, n, vector(_AXES, c))
                 n += 1
-        for k in range(w):
-            done[k] = offsets[i, k] == -math.inf
-        while True:
-            wall = -1
-            for k in range(w):
-                if not done[k] and (wall < 0 or rank[i, k] < rank[i, wall]):
-                    wall = k
-            if wall < 0:
-                break
-            done[wall] = True
+        for wall in order[i]:
+            if offsets[i, wall] == -math.inf:
+                continue
             normal, slot, ratio, shared = vector(normals[i], wall), -1, 1.0, False
             free = free_components(normal, fixed[i])
             for row in range(3):
@@ -445,14 +411,3 @@ def _build(planes, tolerance, least, output):
             else:
                 upper[i, slot] = min(upper[i, slot], bounds[i, wall])
         _complete(own, taken, spanned, n)
-        determinant = dot(vector(own, 0), cross(vector(own, 1), vector(own, 2)))
-        for r in range(3):
-            column = cross(vector(own, (r + 1) % 3), vector(own, (r + 2) % 3))
-            put(inverse[i].T, r, times(1.0 / determinant, column))
-            turn = minus(vector(own, r), vector(_AXES, r))
-            oblique = oblique or not turn[0] == turn[1] == turn[2] == 0.0
-            if lower[i, r] > upper[i, r]:
-                if lower[i, r] > upper[i, r] + tolerance and contradiction < 0:
-                    contradiction = i
-                lower[i, r] = upper[i, r] = 0.5 * (lower[i, r] + upper[i, r])
-    return oblique, contradiction

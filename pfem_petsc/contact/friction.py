@@ -134,15 +134,14 @@ class StepFriction:
         self.slots = walls = len(self._static)
         self._rubs = bool(self._static.any())
         owned = len(contact.members) * self._rubs  # without friction no node sticks or slips
-        self._guessed = np.zeros(owned, dtype=bool)
+        # guessed; known to slip along their direction; found not to stick
+        self._guessed, self._slips, self._failed = np.zeros((3, owned), dtype=bool)
         self._sticks = np.full(owned, -1)  # the slot of what a node sticks to, -1 for none
         self._directions = np.zeros((owned, walls, 3))  # d a of slipping nodes
-        self._slips = np.zeros(owned, dtype=bool)  # known to slip along their direction
         self._forces = np.zeros((owned, 3))  # friction force on each node in its last local solution
         self._firmness = _FIRM
         self._steady = 0  # solves in which no node has begun or ceased to stick or to slip
         self._lagged = False  # friction is treated as a known force
-        self._failed = np.zeros(owned, dtype=bool)  # found not to stick
         self.drag = np.zeros((0, walls, 3))
         self.unsettled = np.empty(0, dtype=np.int64)
 

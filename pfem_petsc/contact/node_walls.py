@@ -74,33 +74,26 @@ def compare_contacts(touching, before, nodes, now, present, releases, wall_of):
 
     ``present`` (owned,) bool is workspace, all False. Returns the number of changes and the nodes that touch walls.
     """
-    walls = touching.shape[1]
-    changes = 0
-    count = 0
-    after = np.empty_like(nodes)
-    for j in range(len(nodes)):
-        i = nodes[j]
+    changes, count, after = 0, 0, np.empty_like(nodes)
+    for i in nodes:
         present[i] = True
-        any_wall = False
-        for k in range(walls):
+    for i in before:
+        for k in range(touching.shape[1] if not present[i] else 0):
+            changes += touching[i, k]
+            releases[wall_of[k]] += touching[i, k]
+            touching[i, k] = False
+    for j in range(len(nodes)):
+        i, met = nodes[j], False
+        present[i] = False
+        for k in range(touching.shape[1]):
             if touching[i, k] != now[j, k]:
                 changes += 1
-                if touching[i, k]:
-                    releases[wall_of[k]] += 1
+                releases[wall_of[k]] += touching[i, k]
                 touching[i, k] = now[j, k]
-            any_wall = any_wall or now[j, k]
-        if any_wall:
+            met = met or now[j, k]
+        if met:
             after[count] = i
             count += 1
-    for i in before:
-        if not present[i]:
-            for k in range(walls):
-                if touching[i, k]:
-                    changes += 1
-                    releases[wall_of[k]] += 1
-                    touching[i, k] = False
-    for i in nodes:
-        present[i] = False
     return changes, after[:count].copy()
 
 

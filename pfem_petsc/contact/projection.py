@@ -11,43 +11,24 @@ import numpy as np
 
 from ..mechanics.compiled import NEEDED, inlined, kernel
 from ..tolerances import FREE_PART, SINGULAR_ROW
-from .rotations import add_to, dot, free_components, minus, put, vector
-from .sweeps import NO_DRAG, Pushes, RubbingRows, compliance, displace, settle_friction
+from .rotations import NOWHERE, add_to, dot, free_components, minus, put, vector
+from .sweeps import Pushes, RubbingRows, compliance, displace, settle_friction
 
 
-@kernel
-def _solve_complementarity(matrix, rhs, n):
-    """Solve the leading n x n system in place, by elimination with pivoting; return False if it is singular."""
-    for k in range(n):
-        pivot = k
-        for i in range(k + 1, n):
-            if abs(matrix[i, k]) > abs(matrix[pivot, k]):
-                pivot = i
-        if matrix[pivot, k] == 0.0:
-            return False
-        if pivot != k:
-            for j in range(k, n):
-                matrix[k, j], matrix[pivot, j] = matrix[pivot, j], matrix[k, j]
-            rhs[k], rhs[pivot] = rhs[pivot], rhs[k]
-        for i in range(k + 1, n):
-            factor = matrix[i, k] / matrix[k, k]
-            if factor != 0.0:
-                for j in range(k + 1, n):
-                    matrix[i, j] -= factor * matrix[k, j]
-                rhs[i] -= factor * rhs[k]
-    for k in range(n - 1, -1, -1):
-        s = rhs[k]
-        for j in range(k + 1, n):
-            s -= matrix[k, j] * rhs[j]
-        rhs[k] = s / matrix[k, k]
-    return True
-
-
-@kernel
-def _active_system(matrix, active, count, system):
-    for a in range(count):
-        for b in range(count):
-            system[a, b] = matrix[active[a], active[b]]
+@inlined
+def _exchange(table, k):
+    """Exchange unknown k and row k of a table (n, n + 1), which gives rows by unknowns and a constant: both are known
+    by the others then."""
+    pivot = table[k, k]
+    for i in range(len(table)):
+        if i != k:
+            factor = table[i, k] / pivot
+            for j in range(len(table) + 1):
+                table[i, j] -= factor * table[k, j]
+            table[i, k] = factor
+    for j in range(len(table) + 1):
+        table[k, j] /= -pivot
+    table[k, k] = 1.0 / pivot
 
 
 @kernel
@@ -59,68 +40,38 @@ def find_multipliers(matrix, values, tolerance, z):
     violated by at most the tolerance count as satisfied.
     """
     n = len(values)
-    active = np.empty(n, dtype=np.int64)
-    held = np.zeros(n, dtype=np.bool_)
-    system, lost = np.empty((n, n)), np.empty(n)
-    count = np.int64(0)
-    for i in range(n):
-        z[i] = 0.0
+    held, table = np.zeros(n, dtype=np.bool_), np.empty((n, n + 1))
+    # of held rows the multipliers, of others the values, by what of each is zero now
+    table[:, :n], table[:, n], z[:] = matrix, values, 0.0
     for _ in range(10 * n + 10):
-        row = -1
-        least = math.inf
+        row, least = -1, math.inf
         for i in range(n):
-            left = values[i]
-            for a in range(count):
-                left += matrix[i, active[a]] * z[active[a]]
-            if held[i]:
-                left = 0.0
+            left = 0.0 if held[i] else table[i, n]
             if left < least or left != left:
                 row, least = i, left
         if n == 0 or least >= -tolerance:
             return True
-        while True:
-            # with the active rows satisfied, a unit of the new multiplier reduces theirs by `lost` and lifts its row
-            _active_system(matrix, active, count, system)
-            for a in range(count):
-                lost[a] = matrix[active[a], row]
-            if not _solve_complementarity(system, lost, count):
-                return False
-            gain = matrix[row, row]
-            for a in range(count):
-                gain -= matrix[row, active[a]] * lost[a]
-            full = -least / gain if gain > SINGULAR_ROW * matrix[row, row] else math.inf
-            part = math.inf
-            out = -1
-            for a in range(count):
-                if lost[a] > 0.0 and z[active[a]] / lost[a] < part:
-                    part = z[active[a]] / lost[a]
-                    out = a
+        while not held[row]:
+            # a unit of the new multiplier changes those of held rows, which stay satisfied, and lifts its row
+            gain, out = table[row, row], -1
+            full = part = math.inf
+            if gain > SINGULAR_ROW * matrix[row, row]:
+                full = -least / gain
+            for a in range(n):
+                if held[a] and table[a, row] < 0.0 and -z[a] / table[a, row] < part:
+                    part, out = -z[a] / table[a, row], a
             step = min(full, part)
             if not step < math.inf:
                 return False
-            for a in range(count):
-                z[active[a]] -= step * lost[a]
+            for a in range(n):
+                z[a] = max(z[a] + step * table[a, row], 0.0) if held[a] else z[a]
             z[row] += step
-            if full <= part:
-                active[count] = row
-                held[row] = True
-                count += 1
-                break
             least += step * max(gain, 0.0)
-            z[active[out]] = 0.0
-            held[active[out]] = False
-            for a in range(out, count - 1):
-                active[a] = active[a + 1]
-            count -= 1
-            for a in range(count):
-                z[active[a]] = max(z[active[a]], 0.0)
-        _active_system(matrix, active, count, system)
-        for a in range(count):
-            lost[a] = -values[active[a]]
-        if not _solve_complementarity(system, lost, count):
-            return False
-        for a in range(count):
-            z[active[a]] = max(lost[a], 0.0)
+            swapped = row if full <= part else out
+            _exchange(table, swapped)
+            held[swapped] = full <= part
+        for a in range(n):
+            z[a] = max(table[a, n], 0.0) if held[a] else 0.0
     return False
 
 
@@ -203,9 +154,7 @@ def _add_planes(at, i, n, planes, room):
         if not dot(free, free) > FREE_PART:
             continue
         rows.values[n], rows.weights[n, 0], room.slot[n] = planes.gaps[at, w], 1.0, w
-        rows.friction[n, 0] = rows.friction[n, 1] = 0.0
-        for k in range(rows.ends.shape[1]):
-            rows.ends[n, k] = i if k == 0 else -1
+        rows.ends[n, :], rows.ends[n, 0], rows.friction[n, :] = -1, i, 0.0
         if len(planes.friction) > 0:
             rows.friction[n, 0], rows.friction[n, 1] = planes.friction[at, w, 0], planes.friction[at, w, 1]
             put(rows.slips, n, vector(planes.slips[at], w))
@@ -232,7 +181,7 @@ def _solve_several(n, rows, tolerances, pushes):
     if not found and tolerances[0] < tolerances[1]:
         found = find_multipliers(gram, values, tolerances[1], normal)
     for a in range(n if found else 0):
-        displace(a, normal[a], NO_DRAG, rows, pushes.moves)
+        displace(a, normal[a], NOWHERE, rows, pushes.moves)
     return found
 
 
@@ -246,13 +195,13 @@ def _solve_rows(n, rows, tolerances, size, pushes):
     normal, drag, moves = pushes
     broken = False
     for a in range(n):
-        normal[a] = drag[a, 0] = drag[a, 1] = drag[a, 2] = 0.0
+        normal[a], drag[a, :] = 0.0, 0.0
         broken = broken or not rows.values[a] >= 0.0
     if not broken:
         return 0
     if n == 1:
         normal[0] = -rows.values[0] / compliance(0, rows)
-        displace(0, normal[0], NO_DRAG, rows, moves)
+        displace(0, normal[0], NOWHERE, rows, moves)
     if (n == 1 and not normal[0] < math.inf) or (n > 1 and not _solve_several(n, rows, tolerances, pushes)):
         return INFEASIBLE
     return 0 if settle_friction(n, rows, size, pushes) else JAMMED
@@ -307,23 +256,20 @@ def press(which, nodes, tolerance, found, several):
     for j in range(first, last):
         if _press_single(j, nodes, tolerance, found) or several is None:
             continue
-        size = 0.0
-        for c in range(3):
-            rows.soft[0, c] = 0.0 if nodes.fixed[j, c] else 1.0 / nodes.stiffness[j]
-            pushes.moves[0, c] = 0.0
-            size += abs(nodes.free[j, c])
+        x, soft = vector(nodes.free, j), 1.0 / nodes.stiffness[j]
+        put(rows.soft, 0, free_components((soft, soft, soft), nodes.fixed[j]))
+        put(pushes.moves, 0, NOWHERE)
         n = _add_planes(j, 0, 0, nodes.planes, room)
-        why = _solve_rows(n, rows, (0.0, tolerance), size, pushes)
+        why = _solve_rows(n, rows, (0.0, tolerance), abs(x[0]) + abs(x[1]) + abs(x[2]), pushes)
         if why > 0 and failed < 0:
             failed, reason = j, why
-        solved = why != INFEASIBLE
         found.normal[j, :] = 0.0
-        for a in range(n if solved else 0):
-            found.normal[j, slot[a]] = pushes.normal[a]
-            put(found.drag[j], slot[a], vector(pushes.drag, a))
-        put(found.x, j, vector(nodes.free, j))
-        if solved:
+        put(found.x, j, x)
+        if why != INFEASIBLE:
             add_to(found.x, j, 1.0, vector(pushes.moves, 0))
+            for a in range(n):
+                found.normal[j, slot[a]] = pushes.normal[a]
+                put(found.drag[j], slot[a], vector(pushes.drag, a))
     return failed, reason
 
 
@@ -371,57 +317,38 @@ class Groups(NamedTuple):
 
 
 class System(NamedTuple):
-    """Rows and their nodes at free positions.
+    """Rows and their nodes at free positions, as they are solved in groups.
 
     Attributes
     ----------
-    ends, gradients : (r, k), (r, k, 3) nodes of each row, -1 for none, and its gradient there
-    values : (r,) rows [m], infinite for rows that do not apply
-    weights, friction, slips : (r, k), (r, 2), (r, 3) of rows, see :class:`~pfem_petsc.contact.sweeps.RubbingRows`
-    stiffness, free : (n,), (n, 3) of nodes: force for a displacement [N/m]; 0.0 where supports prescribe a component
+    rows : RubbingRows, with values that are infinite for rows that do not apply; their normals, and room, are empty
     plane : (n,) index of each node among those at walls (m,), -1 for none; planes : Planes of walls at these
     """
 
-    ends: np.ndarray
-    gradients: np.ndarray
-    values: np.ndarray
-    weights: np.ndarray
-    friction: np.ndarray
-    slips: np.ndarray
-    stiffness: np.ndarray
-    free: np.ndarray
+    rows: RubbingRows
     plane: np.ndarray
     planes: Planes
-
-
-class RowPushes(NamedTuple):
-    """Results for rows (r,) and nodes (n,): normal ``force`` (r,) and ``drag`` (r, 3) [N], displacements (n, 3) [m]."""
-
-    force: np.ndarray
-    drag: np.ndarray
-    moves: np.ndarray
 
 
 @inlined
 def _add_rows(group, groups, system, room):
     """Begin the room with those rows of a group that can press; return how many there are."""
-    ends, gradients, values, weights, friction, slips, _, free, _, _ = system
-    rows, n = room.rows, 0
+    every, rows, n = system.rows, room.rows, 0
     for q in range(groups.starts[group], groups.starts[group + 1]):
         r, square = groups.rows[q], 0.0
-        for k in range(ends.shape[1]):
-            i = ends[r, k]
-            rows.ends[n, k], rows.weights[n, k] = i, weights[r, k]
+        for k in range(every.ends.shape[1]):
+            i = every.ends[r, k]
+            rows.ends[n, k], rows.weights[n, k] = i, every.weights[r, k]
             for c in range(3):
-                rows.gradients[n, k, c] = gradients[r, k, c] * free[i, c] if i >= 0 else 0.0
+                gradient = every.gradients[r, k, c]
+                rows.gradients[n, k, c] = gradient if i >= 0 and every.soft[i, c] > 0.0 else 0.0
                 square += rows.gradients[n, k, c] * rows.gradients[n, k, c]
-                if weights[r, k] != 0.0:
-                    rows.normals[n, c] = gradients[r, k, c] / weights[r, k]
-        if square > FREE_PART and values[r] != math.inf:
-            rows.values[n], room.slot[n] = values[r], r
-            rows.friction[n, 0], rows.friction[n, 1] = friction[r, 0], friction[r, 1]
-            for c in range(3):
-                rows.slips[n, c] = slips[r, c]
+                if every.weights[r, k] != 0.0:
+                    rows.normals[n, c] = gradient / every.weights[r, k]
+        if square > FREE_PART and every.values[r] != math.inf:
+            rows.values[n], room.slot[n] = every.values[r], r
+            rows.friction[n, 0], rows.friction[n, 1] = every.friction[r, 0], every.friction[r, 1]
+            put(rows.slips, n, vector(every.slips, r))
             n += 1
     return n
 
@@ -436,7 +363,7 @@ def project_groups(which, groups, system, tolerances, size, pushes):
     system : System
     tolerances : (groups,) a row violated by at most this counts as satisfied [m]
     size : largest coordinate [m]
-    pushes : RowPushes, output; written for these groups only
+    pushes : Pushes, output; written for these groups only
 
     Returns
     -------
@@ -447,15 +374,13 @@ def project_groups(which, groups, system, tolerances, size, pushes):
     for g in which:
         at_walls = walls * (groups.node_starts[g + 1] - groups.node_starts[g])
         most = max(most, groups.starts[g + 1] - groups.starts[g] + at_walls)
-    room = new_room(most, system.ends.shape[1], np.empty(system.free.shape), pushes.moves)
+    room = new_room(most, system.rows.ends.shape[1], system.rows.soft, pushes.moves)
     for g in which:
         for q in range(groups.starts[g], groups.starts[g + 1]):
-            r = groups.rows[q]
-            pushes.force[r] = pushes.drag[r, 0] = pushes.drag[r, 1] = pushes.drag[r, 2] = 0.0
+            pushes.normal[groups.rows[q]] = 0.0
+            put(pushes.drag, groups.rows[q], NOWHERE)
         for q in range(groups.node_starts[g], groups.node_starts[g + 1]):
-            i = groups.nodes[q]
-            for c in range(3):
-                room.rows.soft[i, c], pushes.moves[i, c] = system.free[i, c] / system.stiffness[i], 0.0
+            put(pushes.moves, groups.nodes[q], NOWHERE)
         count = n = _add_rows(g, groups, system, room)
         for q in range(groups.node_starts[g], groups.node_starts[g + 1] if walls > 0 else 0):
             i = groups.nodes[q]
@@ -465,8 +390,6 @@ def project_groups(which, groups, system, tolerances, size, pushes):
         if why != 0:
             return g, why
         for a in range(count):
-            r = room.slot[a]
-            pushes.force[r] = room.pushes.normal[a]
-            for c in range(3):
-                pushes.drag[r, c] = room.pushes.drag[a, c]
+            pushes.normal[room.slot[a]] = room.pushes.normal[a]
+            put(pushes.drag, room.slot[a], vector(room.pushes.drag, a))
     return -1, 0

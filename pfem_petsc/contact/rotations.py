@@ -10,6 +10,9 @@ import numpy as np
 
 from ..mechanics.compiled import inlined, kernel
 
+NOWHERE = 0.0, 0.0, 0.0
+"""The vector of no length."""
+
 _ROUNDS = 50  # of Newton's method, which needs five
 _NEAR = 1e-9  # last move [rad], the square of which is below rounding
 _SMALL = 1e-2  # angle [rad] below which differences of nearly equal numbers are a series
@@ -110,23 +113,10 @@ def turns_by(vectors):
 
 
 def vectors_of(turns: np.ndarray) -> np.ndarray:
-    """Return rotation vectors (w, 3) [rad] of matrices (w, 3, 3), by angles up to pi.
+    """Return rotation vectors (w, 3) [rad] of matrices (w, 3, 3), by angles up to pi."""
+    from scipy.spatial.transform import Rotation
 
-    They follow from the largest row of 4 q q^T, the products of the quaternion's components, by a square root of no
-    small number.
-    """
-    trace = np.trace(turns, axis1=1, axis2=2)
-    products = np.empty((len(turns), 4, 4))
-    products[:, 1:, 1:] = turns + turns.swapaxes(1, 2) + (1.0 - trace)[:, None, None] * np.eye(3)
-    products[:, 0, 0] = 1.0 + trace
-    for k in range(3):
-        i, j = (k + 1) % 3, (k + 2) % 3
-        products[:, 0, k + 1] = products[:, k + 1, 0] = turns[:, j, i] - turns[:, i, j]
-    quaternion = products[np.arange(len(turns)), np.argmax(np.diagonal(products, axis1=1, axis2=2), axis=1)]
-    quaternion *= np.where(quaternion[:, :1] < 0.0, -1.0, 1.0)
-    sines = np.linalg.norm(quaternion[:, 1:], axis=1)
-    angles = 2.0 * np.arctan2(sines, quaternion[:, 0])
-    return quaternion[:, 1:] * (angles / np.where(sines > 0.0, sines, 1.0))[:, None]
+    return Rotation.from_matrix(turns).as_rotvec() if len(turns) else np.empty((0, 3))
 
 
 @kernel

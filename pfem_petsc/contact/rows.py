@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from mpi4py import MPI
+from petsc4py import PETSc
 
 from ..errors import SimulationFailure
 from ..mechanics.compiled import kernel
@@ -21,7 +22,9 @@ from ..parallel.natural import NaturalOrder
 from ..tolerances import FREE_PART
 from .constraints.base import Constraint
 from .plugins import checked
-from .projection import JAMMED, Groups, Planes, RowPushes, System, project_groups
+from .projection import JAMMED, Groups, Planes, System, project_groups
+from .rotations import along, minus, put, vector
+from .sweeps import Pushes, RubbingRows
 
 if TYPE_CHECKING:
     from ..mesh.distribution import DistributedMesh
@@ -34,14 +37,10 @@ def owner_starts(mesh: DistributedMesh) -> np.ndarray:
 
 def petsc_numbers(mesh: DistributedMesh, numbers: np.ndarray) -> np.ndarray:
     """Return the PETSc numbers of nodes given by mesh numbers (n,), which any rank may own. Collective."""
-    comm, ids = mesh.comm, mesh.node_ids[: mesh.n_owned]
-    to_slab = Router(comm, slab_of(ids, mesh.n_nodes, comm.size))
-    known, at = to_slab.send(ids), to_slab.send(mesh.first_node + np.arange(mesh.n_owned))
-    order = np.argsort(known)
-    wanted, place = np.unique(numbers, return_inverse=True)
-    asking = Router(comm, slab_of(wanted, mesh.n_nodes, comm.size))
-    asked = asking.send(wanted)
-    return asking.reply(at[order[np.searchsorted(known[order], asked)]])[place.ravel()]
+    order = PETSc.AO().createMemoryScalable(mesh.node_ids[: mesh.n_owned].astype(PETSc.IntType), comm=mesh.comm)
+    found = order.app2petsc(numbers.astype(PETSc.IntType))
+    order.destroy()
+    return found.astype(np.int64)
 
 
 def once(rows: np.ndarray) -> np.ndarray:
@@ -71,8 +70,9 @@ def with_groups(rows: np.ndarray, columns: Sequence[int], starts: np.ndarray, co
 
     ``rows`` (r, k) are all rows with a node of this rank; see :func:`to_owners`.
     """
-    own = rows
-    order = [np.argsort(own[:, at], kind="stable") for at in columns]
+    own, ends = rows, rows[:, columns].T
+    order = np.argsort(ends.ravel(), kind="stable")
+    keys, row = ends.ravel()[order], order % max(len(own), 1)
     first, last = starts[comm.rank], starts[comm.rank + 1]
     known = np.empty(0, dtype=np.int64)
     while True:
@@ -83,15 +83,10 @@ def with_groups(rows: np.ndarray, columns: Sequence[int], starts: np.ndarray, co
         known = np.union1d(known, asked)
         asking = Router(comm, np.searchsorted(starts, asked, side="right") - 1)
         wanted = asking.send(np.column_stack([asked, np.full(len(asked), comm.rank)]))
-        answers, ranks = [], []
-        for column, at in zip(columns, order, strict=True):
-            keys = own[at, column]
-            begin = np.searchsorted(keys, wanted[:, 0])
-            count = np.searchsorted(keys, wanted[:, 0], side="right") - begin
-            place = np.arange(count.sum()) + np.repeat(begin - np.cumsum(count) + count, count)
-            answers.append(own[at[place]])
-            ranks.append(np.repeat(wanted[:, 1], count))
-        answer = Router(comm, np.concatenate(ranks)).send(np.concatenate(answers))
+        begin = np.searchsorted(keys, wanted[:, 0])
+        count = np.searchsorted(keys, wanted[:, 0], side="right") - begin
+        place = np.arange(count.sum()) + np.repeat(begin - np.cumsum(count) + count, count)
+        answer = Router(comm, np.repeat(wanted[:, 1], count)).send(own[row[place]])
         rows = once(np.concatenate([rows, answer]))
 
 
@@ -106,37 +101,30 @@ def gather_rows(at, array, vectors):
 
 
 @kernel
-def find_broken(groups, system, x, tolerances):
+def find_broken(groups, values, walls, x, tolerances):
     """Find groups with a row below its bound or a node beyond a wall; return their number.
 
     Parameters
     ----------
     groups : Groups
-    system : System; x : (n, 3) positions
+    values : (r,) of rows; walls : ``plane`` and ``planes`` of a System; x : (n, 3) positions
     tolerances : (groups,) in: a row among several that is violated by at most this counts as satisfied; out: the same,
         or the rounding of the group's positions, of the groups found, and -1 of the others
     """
     starts, rows, node_starts, nodes = groups
-    count, values, gaps = 0, system.values, system.planes.gaps
+    (plane, planes), count = walls, 0
     for g in range(len(starts) - 1):
         least = tolerances[g] if starts[g + 1] - starts[g] > 1 else 0.0
-        broken = False
+        broken, largest = False, 0.0
         for q in range(starts[g], starts[g + 1]):
             broken = broken or not values[rows[q]] >= -least
-        if gaps.shape[1] > 0:
-            for q in range(node_starts[g], node_starts[g + 1]):
-                at = system.plane[nodes[q]]
-                for w in range(gaps.shape[1] if at >= 0 else 0):
-                    broken = broken or gaps[at, w] < 0.0
-        if not broken:
-            tolerances[g] = -1.0
-            continue
-        largest = 0.0
         for q in range(node_starts[g], node_starts[g + 1]):
-            for c in range(3):
-                largest = max(largest, abs(x[nodes[q], c]))
-        tolerances[g] = max(tolerances[g], 16.0 * 2.0**-52 * largest)
-        count += 1
+            i = nodes[q]
+            largest = max(largest, abs(x[i, 0]), abs(x[i, 1]), abs(x[i, 2]))
+            for w in range(planes.gaps.shape[1] if plane[i] >= 0 else 0):
+                broken = broken or planes.gaps[plane[i], w] < 0.0
+        tolerances[g] = max(tolerances[g], 16.0 * 2.0**-52 * largest) if broken else -1.0
+        count += broken
     return count
 
 
@@ -146,54 +134,36 @@ def advance_groups(which, groups, x, moves, at, tolerances, settled):
     already, to the tolerances (groups,)."""
     _, _, node_starts, nodes = groups
     for k in range(len(which)):
-        g = which[k]
-        same = True
-        for q in range(node_starts[g], node_starts[g + 1]):
+        settled[k] = True
+        for q in range(node_starts[which[k]], node_starts[which[k] + 1]):
             i = nodes[q]
-            for c in range(3):
-                place = x[i, c] + moves[i, c]
-                same = same and abs(place - at[i, c]) <= tolerances[g]
-                at[i, c] = place
-        settled[k] = same
+            place = along(vector(x, i), 1.0, vector(moves, i))
+            way = minus(place, vector(at, i))
+            settled[k] &= max(abs(way[0]), abs(way[1]), abs(way[2])) <= tolerances[which[k]]
+            put(at, i, place)
 
 
 @kernel
-def linearise(rows, system, x, at, own):
-    """Extrapolate ``own`` of rows (m,) at positions ``at`` (n, 3) to ``x`` (n, 3), into the values of a System."""
-    ends, gradients, values, free = system.ends, system.gradients, system.values, system.free
-    for k in range(len(rows)):
-        r = rows[k]
+def linearise(which, rows, x, at, own):
+    """Extrapolate ``own`` of some RubbingRows (m,) at positions ``at`` (n, 3) to ``x`` (n, 3), into their values."""
+    for k in range(len(which)):
         total = 0.0
-        for e in range(ends.shape[1]):
-            i = ends[r, e]
-            if i >= 0:
-                for c in range(3):
-                    total += gradients[r, e, c] * free[i, c] * (x[i, c] - at[i, c])
-        values[r] = own[k] + total
-
-
-class RowForces(NamedTuple):
-    """Forces of rows (r,) on their nodes (k of each): ``normal`` (r,) times ``gradients`` (r, k, 3), and ``drag``
-    (r, 3) times ``weights`` (r, k) [N]."""
-
-    gradients: np.ndarray
-    normal: np.ndarray
-    weights: np.ndarray
-    drag: np.ndarray
+        for e in range(rows.ends.shape[1]):
+            i = rows.ends[which[k], e]
+            for c in range(3 if i >= 0 else 0):
+                total += rows.gradients[which[k], e, c] * (x[i, c] - at[i, c]) if rows.soft[i, c] > 0.0 else 0.0
+        rows.values[which[k]] = own[k] + total
 
 
 @kernel
-def add_forces(ends, forces, load):
-    """Add the forces of rows, RowForces, to those on their nodes (n, 3)."""
-    gradients, force, weights, drag = forces
-    for r in range(len(force)):
-        if force[r] == 0.0:
-            continue
-        for k in range(ends.shape[1]):
+def add_forces(ends, gradients, normal, weights, drag, load):
+    """Add forces of rows (r,) to those on their nodes (n, 3): ``normal`` (r,) times ``gradients`` (r, k, 3), and
+    ``drag`` (r, 3) times ``weights`` (r, k) [N]."""
+    for r in range(len(normal)):
+        for k in range(ends.shape[1] if normal[r] != 0.0 else 0):
             i = ends[r, k]
-            if i >= 0:
-                for c in range(3):
-                    load[i, c] += force[r] * gradients[r, k, c] + weights[r, k] * drag[r, c]
+            for c in range(3 if i >= 0 else 0):
+                load[i, c] += normal[r] * gradients[r, k, c] + weights[r, k] * drag[r, c]
 
 
 @kernel
@@ -209,26 +179,11 @@ def free_positions(where, predictor, u, far, x):
 
 
 @kernel
-def last_forces(counted, source, last, forces, totals):
-    """Write the forces of counted rows, RowForces sorted by source, on their last nodes to the totals (sources, 3)."""
-    gradients, force, weights, drag = forces
-    before = -1
-    for r in range(len(force)):
-        if counted[r]:
-            for c in range(3):
-                push = force[r] * gradients[r, last[r], c] + weights[r, last[r]] * drag[r, c]
-                totals[source[r], c] = totals[source[r], c] + push if source[r] == before else push
-            before = source[r]
-
-
-@kernel
 def push_nodes(where, load, free, stiffness, u, contact):
     """Move owned nodes of u (owned, 3) by forces ``load`` (n, 3) of rows, and add these to ``contact`` (owned, 3)."""
     for k in range(len(where)):
         i = where[k]
-        if i < 0:
-            continue
-        for c in range(3):
+        for c in range(3 if i >= 0 else 0):
             if load[k, c] != 0.0:
                 u[i, c] += load[k, c] * free[k, c] / stiffness[i]
                 contact[i, c] += load[k, c]
@@ -428,21 +383,14 @@ class RowSet:
 
     def alike_of(self, which: np.ndarray) -> list[Alike]:
         """Return some of the groups, (groups,) bool, collected by shape."""
-        found = []
-        for each in self.alike:
-            some = which[self.group_of_row[each.rows[:, 0]]]
-            if some.any():
-                found.append(Alike(each.rows[some], each.nodes[some], each.ends[some]))
-        return found
+        parts = ((each, which[self.group_of_row[each.rows[:, 0]]]) for each in self.alike)
+        return [Alike(each.rows[some], each.nodes[some], each.ends[some]) for each, some in parts if some.any()]
 
     def gather(self, values: np.ndarray) -> np.ndarray:
         """Return float64 values (n, ...) at the nodes from those at owned nodes (owned, ...). Collective."""
-        shape = values.shape[1:]
-        width = int(np.prod(shape))
-        far = np.empty((0, width))
-        if width and not self.partners.alone:
-            far = self.partners.bring(values[self.partners.rows].reshape(-1, width))
-        return self.spread(values, far.reshape(len(far), *shape)).astype(float, copy=False)
+        width = int(np.prod(values.shape[1:]))
+        every = self.collect(lambda at: values[at].reshape(len(at), width))
+        return every.reshape(len(every), *values.shape[1:]).astype(float, copy=False)
 
     def spread(self, values: np.ndarray, far: np.ndarray) -> np.ndarray:
         """Return values (n, ...) at the nodes from those at owned nodes (owned, ...) and those received (m, ...)."""
@@ -512,9 +460,9 @@ class RowSet:
         if len(self._away) == 0 and self.partners.alone:
             return own
         every = np.empty((len(self.numbers), own.shape[1]))
-        every[self.mine] = own
-        far = self.partners.bring(of_nodes(self.partners.rows))
-        every[self._away] = far[self._far]
+        if own.shape[1]:
+            every[self.mine] = own
+            every[self._away] = self.partners.bring(of_nodes(self.partners.rows))[self._far]
         return every
 
     def slips(self, y: np.ndarray) -> np.ndarray:
@@ -523,13 +471,9 @@ class RowSet:
 
     def forces(self, jacobian: np.ndarray, force: np.ndarray, drag: np.ndarray | None = None) -> np.ndarray:
         """Return J^T f (n, 3) [N] for the forces (r,) of the rows, and their drags (r, 3) times weights [N]."""
-        total = np.zeros((len(self.numbers), 3))
-        add_forces(self.ends, self.loads(jacobian, force, drag), total)
+        total, drag = np.zeros((len(self.numbers), 3)), np.zeros((len(force), 3)) if drag is None else drag
+        add_forces(self.ends, jacobian, force, self.weights, drag, total)
         return total
-
-    def loads(self, jacobian: np.ndarray, force: np.ndarray, drag: np.ndarray | None = None) -> RowForces:
-        """Return the forces of rows on their nodes."""
-        return RowForces(jacobian, force, self.weights, np.zeros((len(force), 3)) if drag is None else drag)
 
     def usable(self, jacobian: np.ndarray) -> np.ndarray:
         """Return (r,) bool: rows with free components, which can be satisfied."""
@@ -540,16 +484,18 @@ class RowSet:
         jacobian: np.ndarray,
         values: np.ndarray,
         nodes: FreeNodes,
-        planes: tuple[np.ndarray, Planes] | None = None,
+        plane: np.ndarray,
+        planes: Planes,
     ) -> System:
-        """Return rows (r,) with gradients (r, k, 3), and ``planes`` of walls, for :meth:`solve`."""
+        """Return rows (r,) with gradients (r, k, 3), and planes of walls at nodes, for :meth:`solve`."""
         slips, friction = np.zeros((len(values), 3)), self.friction
         if self.rubs and nodes.rub:
             slips = self.slips(nodes.x - nodes.start)
         elif self.rubs:
             friction = np.zeros_like(friction)
-        rubbing = self.weights, friction, slips, nodes.stiffness, nodes.free
-        return System(self.ends, jacobian, values, *rubbing, *(self._no_planes if planes is None else planes))
+        soft, room = nodes.free / nodes.stiffness[:, None], np.empty((0, 2))
+        rows = RubbingRows(self.ends, self.weights, jacobian, slips[:0], values, slips, friction, soft, room)
+        return System(rows, plane, planes)
 
     def gather_of(self, at: np.ndarray, of_nodes: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
         """Return values (2, m, n) at the first two nodes of rows ``at`` (m,); ``of_nodes`` gives (k, n) at owned nodes.
@@ -567,7 +513,7 @@ class RowSet:
             data[1 - end, cut] = swap(self.mesh.comm, self.owners[at[cut], 1 - end], data[end, cut])
         return data
 
-    def solve(self, system: System, tolerance: float, size: float) -> RowPushes:
+    def solve(self, system: System, tolerance: float, size: float) -> Pushes:
         """Return the forces that satisfy linear rows; those violated by at most the tolerance count as satisfied;
         ``size``: largest value of what moves the rows.
 
@@ -577,22 +523,24 @@ class RowSet:
             On ranks with rows that are infeasible.
         """
         pushes, nowhere = self._no_pushes(), np.zeros((len(self.numbers), 3))
-        groups, tolerances = self._broken(system, nowhere, tolerance)
+        groups, tolerances = self._broken(system.rows.values, (system.plane, system.planes), nowhere, tolerance)
         self._solve(groups, system, tolerances, size, pushes)
         return pushes
 
-    def _no_pushes(self) -> RowPushes:
-        return RowPushes(np.zeros(len(self.source)), np.zeros((len(self.source), 3)), np.zeros((len(self.numbers), 3)))
+    def _no_pushes(self) -> Pushes:
+        return Pushes(np.zeros(len(self.source)), np.zeros((len(self.source), 3)), np.zeros((len(self.numbers), 3)))
 
-    def _broken(self, system: System, x: np.ndarray, tolerance: float) -> tuple[np.ndarray, np.ndarray]:
+    def _broken(
+        self, values: np.ndarray, walls: tuple[np.ndarray, Planes], x: np.ndarray, tolerance: float
+    ) -> tuple[np.ndarray, np.ndarray]:
         """Return the groups (g,) with rows below their bounds or nodes at (n, 3) beyond walls, and the tolerances of
         all groups."""
         tolerances = np.full(len(self.groups.starts) - 1, tolerance)
-        if not find_broken(self.groups, system, x, tolerances):
+        if not find_broken(self.groups, values, walls, x, tolerances):
             return np.empty(0, dtype=np.int64), tolerances
         return np.flatnonzero(~(tolerances < 0.0)), tolerances
 
-    def _solve(self, which: np.ndarray, system: System, tolerances: np.ndarray, size: float, pushes: RowPushes) -> None:
+    def _solve(self, which: np.ndarray, system: System, tolerances: np.ndarray, size: float, pushes: Pushes) -> None:
         group, why = project_groups(which, self.groups, system, tolerances, size, pushes)
         if group >= 0:
             raise SimulationFailure(self.unsolved(group, why))
@@ -613,9 +561,8 @@ class RowSet:
 
     def project(
         self, nodes: FreeNodes, tolerance: float, walls: WallsOfNodes | None = None, lift: np.ndarray | float = 0.0
-    ) -> tuple[RowPushes, np.ndarray, System]:
-        """Return the forces that satisfy the rows, the gradients (r, k, 3) along which they act, and the rows as they
-        were solved.
+    ) -> tuple[Pushes, np.ndarray]:
+        """Return the forces that satisfy the rows, and the gradients (r, k, 3) along which they act.
 
         Parameters
         ----------
@@ -630,20 +577,22 @@ class RowSet:
             On ranks with rows that are infeasible.
         """
         x, jacobian, pushes = nodes.x, self.fixed_jacobian, self._no_pushes()
-        planes = None if walls is None else (walls.plane, walls.planes(x, x))
-        system = self.system(jacobian, self.values(x) - lift, nodes, planes)
-        groups, tolerances = self._broken(system, x, tolerance)
+        values, planes = self.values(x) - lift, self._no_planes
+        if walls is not None:
+            planes = walls.plane, walls.planes(x, x)
+        groups, tolerances = self._broken(values, planes, x, tolerance)
         if len(groups) == 0:
-            return pushes, jacobian, system
+            return pushes, jacobian
         size, again = float(np.abs(x).max()), self._turning
         if walls is not None:
             again = again.copy()
             again[self.group_of_node[walls.varying]] = True
         if not again[groups].any():
-            self._solve(groups, system, tolerances, size, pushes)
-            return pushes, jacobian, system
+            self._solve(groups, self.system(jacobian, values, nodes, *planes), tolerances, size, pushes)
+            return pushes, jacobian
         jacobian, at, rows, chosen = jacobian.copy(), x.copy(), None, np.empty(len(again), dtype=bool)
-        system, lift, pushed = system._replace(gradients=jacobian), np.broadcast_to(lift, len(self.source)), x.copy()
+        system = self.system(jacobian, values, nodes, *planes)
+        lift, pushed = np.broadcast_to(lift, len(self.source)), x.copy()
         for _ in range(_ITERATIONS):
             chosen[:] = False
             chosen[groups] = True
@@ -652,9 +601,9 @@ class RowSet:
             if rows is None or not nodes.at_start:
                 jacobian[turned] = self.gradients(nodes.start if nodes.at_start else at, turned)
             if rows is not None:
-                linearise(fewer, system, x, at, self.values(at, fewer) - lift[fewer])
+                linearise(fewer, system.rows, x, at, self.values(at, fewer) - lift[fewer])
                 if walls is not None:
-                    load = self.forces(jacobian, pushes.force, pushes.drag) * nodes.free
+                    load = self.forces(jacobian, pushes.normal, pushes.drag) * nodes.free
                     pushed += 0.5 * (x + load / nodes.stiffness[:, None] - pushed)  # or walls may alternate
                     system = system._replace(planes=walls.planes(at, pushed))
             rows = fewer
@@ -663,7 +612,7 @@ class RowSet:
             advance_groups(groups, self.groups, x, pushes.moves, at, tolerances, settled)
             groups = groups[~settled & again[groups]]
             if len(groups) == 0:
-                return pushes, jacobian, system
+                return pushes, jacobian
         raise SimulationFailure(
             f"the positions of nodes {self._shown(int(groups[0]))} on their constraints and walls did not converge in "
             f"{_ITERATIONS} iterations; reduce time.step"

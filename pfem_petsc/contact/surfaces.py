@@ -9,6 +9,7 @@ from typing import NamedTuple, Self
 import numpy as np
 
 from ..mechanics.compiled import inlined, kernel, record
+from .rotations import along, dot, minus, put, times, vector
 from .walls.base import BaseWall, RoundWall
 
 OTHER = np.inf
@@ -37,19 +38,15 @@ class Surfaces(NamedTuple):
     def of(cls, walls: Sequence[BaseWall], turning: np.ndarray) -> Self:
         """Return the surfaces of walls at rest; ``turning`` (w,) bool: walls that turn, which are other ones."""
         normals, centres, axes = np.zeros((3, len(walls), 3))
-        made = cls(normals, np.zeros(len(walls)), centres, axes, np.zeros(len(walls)))
-        for k, wall in enumerate(walls):
-            kind = type(wall)
-            if turning[k]:
-                made.radii[k] = OTHER
-            elif wall.flat:
-                made.normals[k], made.offsets[k] = wall.normal, wall.offset
+        made = cls(normals, np.zeros(len(walls)), centres, axes, np.full(len(walls), OTHER))
+        for k in np.flatnonzero(~turning):
+            wall, kind = walls[k], type(walls[k])
+            if wall.flat:
+                made.normals[k], made.offsets[k], made.radii[k] = wall.normal, wall.offset, 0.0
             # a class that derives from such a wall may be another surface
             elif (kind.planes, kind.gaps) == (RoundWall.planes, RoundWall.gaps):
                 made.normals[k], made.axes[k] = wall.sign * wall.across, wall.axis
                 made.centres[k], made.radii[k] = wall.centre, wall.sign * wall.radius
-            else:
-                made.radii[k] = OTHER
         return made
 
     def copy(self) -> Self:
@@ -69,38 +66,31 @@ def is_round(radius):
 
 
 @inlined
-def tangent(k, surfaces, x, y, z):
-    """Return the normal of surface k nearest to a position, and the distance from it [m], negative beyond it."""
-    normals, radius = surfaces.normals, surfaces.radii[k]
-    nx, ny, nz = normals[k, 0], normals[k, 1], normals[k, 2]
+def beyond(normal, offset, place):
+    """Return the distance of a place (3,) from the plane n . x = d [m], rounded as in searches for nodes beyond it."""
+    return -offset + normal[0] * place[0] + normal[1] * place[1] + normal[2] * place[2]
+
+
+@inlined
+def tangent(k, surfaces, place):
+    """Return the normal of surface k nearest to a place (3,), and the distance from it [m], negative beyond it."""
+    normal, radius = vector(surfaces.normals, k), surfaces.radii[k]
     if radius == 0.0:
-        return nx, ny, nz, -surfaces.offsets[k] + nx * x + ny * y + nz * z
-    centres, axes = surfaces.centres, surfaces.axes
-    x -= centres[k, 0]
-    y -= centres[k, 1]
-    z -= centres[k, 2]
-    along = x * axes[k, 0] + y * axes[k, 1] + z * axes[k, 2]
-    x -= along * axes[k, 0]
-    y -= along * axes[k, 1]
-    z -= along * axes[k, 2]
-    length = math.sqrt(x * x + y * y + z * z)
-    side = 1.0 if radius > 0.0 else -1.0
+        return normal, beyond(normal, surfaces.offsets[k], place)
+    arm, axis = minus(place, vector(surfaces.centres, k)), vector(surfaces.axes, k)
+    arm = along(arm, -dot(arm, axis), axis)
+    length, side = math.sqrt(dot(arm, arm)), 1.0 if radius > 0.0 else -1.0
     if length > 1e-12 * abs(radius):
-        unit = side / length
-        nx, ny, nz = unit * x, unit * y, unit * z
-    return nx, ny, nz, side * length - radius
+        normal = times(side / length, arm)
+    return normal, side * length - radius
 
 
 @kernel
 def wall_gaps(nodes, x, surfaces):
     """Return normals (m, w, 3) and distances (m, w) [m] of nodes (m,) at x (owned, 3) from :class:`Surfaces`."""
-    w = len(surfaces.radii)
-    normals = np.empty((len(nodes), w, 3))
-    gaps = np.empty((len(nodes), w))
+    normals, gaps = np.empty((len(nodes), len(surfaces.radii), 3)), np.empty((len(nodes), len(surfaces.radii)))
     for j in range(len(nodes)):
-        i = nodes[j]
-        for k in range(w):
-            normals[j, k, 0], normals[j, k, 1], normals[j, k, 2], gaps[j, k] = tangent(
-                k, surfaces, x[i, 0], x[i, 1], x[i, 2]
-            )
+        for k in range(gaps.shape[1]):
+            normal, gaps[j, k] = tangent(k, surfaces, vector(x, nodes[j]))
+            put(normals[j], k, normal)
     return normals, gaps

@@ -18,14 +18,13 @@ from typing import NamedTuple
 import numpy as np
 
 from ..mechanics.compiled import inlined, kernel
-from .rotations import add_to, along, dot, minus, put, times, vector
+from .rotations import NOWHERE, add_to, along, dot, minus, put, times, vector
 
 _SWEEPS = 20_000
 _STEADY = 10_000  # sweeps after which those that have not settled go half as far
 _BROKEN = 1_000  # sweeps after which static friction no longer holds: with it there may be no solution
 _SLIDES = 1e-13  # of the position: slips beyond are no rounding
 _OVERSHOOT = 0.9  # of the drag over the normal force, from which on sweeps go a part of the way
-NO_DRAG = 0.0, 0.0, 0.0
 _SETTLED = 1e-15  # of forces and positions: changes that are rounding
 
 
@@ -56,7 +55,8 @@ class RubbingRows(NamedTuple):
 
 
 class Pushes(NamedTuple):
-    """Normal forces of rows (r,) and drags (r, 3) [N], and the displacements (n, 3) of the nodes by these [m]."""
+    """``normal`` forces of rows (r,) and ``drag`` (r, 3) [N], and the displacements ``moves`` (n, 3) of nodes by these
+    [m]."""
 
     normal: np.ndarray
     drag: np.ndarray
@@ -66,7 +66,7 @@ class Pushes(NamedTuple):
 @inlined
 def _softness(a, rows):
     """Return the displacements of the components of a row's coordinate by unit forces on them."""
-    total = NO_DRAG
+    total = NOWHERE
     for d in range(rows.ends.shape[1]):
         i = rows.ends[a, d]
         if i >= 0:
@@ -121,21 +121,17 @@ def _slides_along_guide(count, rows, size, pushes):
     normal force without friction, N (n_f - mu s_f/|s|) = N_0 n_f: no sweeps are needed, which creep where the normal
     is almost across the guide.
     """
-    a, free = -1, -1
+    a, free, pressing, moving = -1, -1, 0, 0
     for b in range(count):
         if pushes.normal[b] > 0.0:
-            if a >= 0:
-                return False
-            a = b
-    if a < 0 or not rows.friction[a, 0] > 0.0:
+            a, pressing = b, pressing + 1
+    if pressing != 1 or not rows.friction[a, 0] > 0.0:
         return False
     soft = _softness(a, rows)
     for c in range(3):
         if soft[c] > 0.0:
-            if free >= 0:
-                return False
-            free = c
-    if free < 0:
+            free, moving = c, moving + 1
+    if moving != 1:
         return False
     n = vector(rows.normals, a)
     slip = _across(_slip_of(a, rows, pushes.moves), n)
@@ -192,7 +188,7 @@ def settle_friction(count, rows, size, pushes):
     normal, drag, moves = pushes
     pressed, largest = False, 0.0
     for a in range(count):
-        put(drag, a, NO_DRAG)
+        put(drag, a, NOWHERE)
         pressed = pressed or (normal[a] > 0.0 and friction[a, 1] > 0.0)
         largest = max(largest, normal[a])
     if not pressed or _slides_along_guide(count, rows, size, pushes):
@@ -215,7 +211,7 @@ def settle_friction(count, rows, size, pushes):
             # where supports leave little of a normal free, rounding is amplified in forces
             limit = _SETTLED * (before + size / gives[a, 1])
             settled = settled and abs(change) <= limit
-            displace(a, part * change, NO_DRAG, rows, moves)
+            displace(a, part * change, NOWHERE, rows, moves)
             normal[a] = old + part * change
             largest = max(largest, normal[a])
             if friction[a, 1] == 0.0:

@@ -150,8 +150,8 @@ class RowCoordinates:
         tolerance = PROJECTED * self.constraints.contact.size
         nodes = FreeNodes(x, k, self._start, self._part == 0.0, rows.free, rub=False)
         with agreed(self.comm):
-            pushes, jacobian, _ = rows.project(nodes, tolerance)
-        u[here] += (rows.forces(jacobian, pushes.force) * rows.free / k[:, None])[rows.mine]
+            pushes, jacobian = rows.project(nodes, tolerance)
+        u[here] += (rows.forces(jacobian, pushes.normal) * rows.free / k[:, None])[rows.mine]
 
     def _all(self, array: np.ndarray) -> np.ndarray:
         """Return the unknowns (3 n,) of all nodes from an array whose first rows are owned nodes. Collective."""
@@ -242,7 +242,7 @@ class RowCoordinates:
         force, own = g[node, component] / self._scale[row], np.zeros(w.shape)
         own[node, component] = np.where((w[node, component] <= lower[node, component]) & (force > noise), force, 0.0)
         self.constraints.release()
-        self.constraints.jacobian = self.jacobian
+        self.constraints.gradients = self.jacobian
         self.constraints.force[self._placed] = self._all(own)[self._pivot[self._placed]]
 
     def set_forces(self, nodes: np.ndarray, normal: np.ndarray, drag: np.ndarray) -> None:

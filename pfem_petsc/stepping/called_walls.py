@@ -106,8 +106,7 @@ def _may_stop(k, called, starts, ends, i, step):
             square += (ends[c, i] - called.pivots[k, c]) ** 2
         slack += called.reach[k, 0] + called.reach[k, 1] * math.sqrt(square)
     if called.at_rest.radii[k] != OTHER:
-        _, _, _, gap = tangent(k, called.at_rest, end[0], end[1], end[2])
-        return gap < slack
+        return tangent(k, called.at_rest, end)[1] < slack
     start = _at_rest(called.poses[step + 1, k], starts[0, i], starts[1, i], starts[2, i])
     box, meets = called.boxes[k], True
     for c in range(3):

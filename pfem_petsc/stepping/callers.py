@@ -111,8 +111,7 @@ class RowCaller(Caller):
     def _count_closed(self) -> None:
         """Count the rows without which the loop cannot go on alone: with forces, closed, or about to rebound."""
         links = self.links
-        closed = (links.force > 0.0) | (links.rebound > 0.0)
-        closed[links.two.at] |= links.two.record.closed
+        closed = (links.force > 0.0) | (links.rebound > 0.0) | (links.closed > 0)
         self.record.counts[CLOSED] = np.count_nonzero(closed)
 
     def _make(self, step: int, what: int) -> None:
@@ -141,7 +140,7 @@ class RowCaller(Caller):
         self._keep(HELD, links.pressed())
         self._count_closed()
         two = links.two
-        changed = (links.force[two.at] > 0.0) != two.record.closed
+        changed = (links.force[two.at] > 0.0) != links.closed[two.at]
         if changed.any():
             nodes = two.nodes[:, changed]
             self._keep(CHANGING, np.unique(nodes[nodes >= 0]))
@@ -246,9 +245,9 @@ class WallCaller(Caller):
             except OutOfReachError:
                 record.reach[bodies.at] = walls.limits
                 return AGAIN
-            m, sums = len(stopped.nodes), stopped.walls
+            m, sums = len(stopped.walls.nodes), stopped.walls
             record.counts[FOUND], record.losses[0] = m, sums.friction
-            out.nodes[:m], out.places[:m], out.touching[:m] = stopped.nodes, stopped.places, sums.touching
+            out.nodes[:m], out.places[:m], out.touching[:m] = sums.nodes, sums.places, sums.touching
             record.force[:m] = stopped.force
             out.force[:], out.contacts[:], out.moment[:] = sums.force, sums.contacts, sums.moment
         else:

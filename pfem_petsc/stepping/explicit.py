@@ -140,7 +140,7 @@ class RedistributedStepper(Stepper):
         model, state, moved = self.model, self.state, self.moved
         supports, owned = model.supports, model.mesh.n_owned
         load = state.external - state.f[:owned]
-        state.contact, walls = self.massless.press(state.position, load, state.time)
+        state.contact, walls = self.massless.press(model, state.position, load, state.time)
         pull = load + state.contact
         if supports.any:
             at = (supports.nodes, supports.components)
@@ -167,7 +167,7 @@ class RedistributedStepper(Stepper):
         model, nodes = self.model, self.moved.nodes
         x = self._trial
         x[: model.mesh.n_owned] = balance.predictor + u
-        largest = self.massless.settle(x, balance.time, self.state.time)
+        largest = self.massless.settle(model, x, balance.time, self.state.time)
         if not largest <= BEYOND * model.size:
             self.fault = SimulationFailure(
                 f"{self.when(balance)}: contact nodes without mass found no equilibrium (last move {largest:.3g} "

@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from mpi4py import MPI
 
-from ..contact.fixed_rows import close_rows
 from ..contact.surfaces import wall_gaps
 from ..mechanics.compiled import kernel, record
 from ..tolerances import ON_BOUND
@@ -330,10 +329,8 @@ class Impacts:
     def of_rows(self, x: np.ndarray, motion: tuple[np.ndarray, np.ndarray], load: np.ndarray | None) -> float:
         """Return the loss of closing rows over two nodes whose second nodes this rank owns, with the reduced mass."""
         links, mass = self.model.links, self.model.inertia.mass
-        two, rows = links.two, links.two.record
-        rows.force[:] = links.force[two.at]
-        pressed = rows.force > 0.0
-        at = np.flatnonzero(pressed != rows.closed)
+        two, force = links.two, links.force[links.two.at]
+        at = np.flatnonzero((force > 0.0) != links.closed[two.at])
         if len(at) == 0:
             return 0.0
 
@@ -341,5 +338,6 @@ class Impacts:
             free_v, free_a = self._free(nodes, motion, load)
             return np.column_stack([x[nodes], free_v, free_a, mass[nodes]])
 
-        rows.closed[:] = pressed
-        return close_rows(rows, at, links.rows.gather_of(two.at[at], of_nodes), two.counted, self.slack)
+        ends = links.rows.gather_of(two.at[at], of_nodes)
+        links.closed[two.at[at]], lost = two.close(at, force[at], ends, self.slack)
+        return lost

@@ -211,7 +211,7 @@ class Stepper(ABC):
         nothing records
     iterations : numbers of Newton and linear iterations since the last row of the history
     before : (local, 3) positions at the start of the last part, with ghosts [m]
-    massless : MasslessNodes if contact nodes are massless along their walls' normals, else None
+    massless : Redistribution if contact nodes are massless along their walls' normals, else None
     prescribed : PrescribedMotion of supports
     ruptures : Ruptures, which counts broken bars
     removals : Removals of bars and supports
@@ -271,8 +271,7 @@ class Stepper(ABC):
         )
         self.before = mesh.points.copy()
         model.contact.state = self.state
-        moved = model.inertia.redistribution
-        self.massless = None if moved is None else moved.massless(model)
+        self.massless = model.inertia.redistribution
         self.step_changed = False
         self.support_changes = 0
         self.prescribed = PrescribedMotion(self)
@@ -324,7 +323,7 @@ class Stepper(ABC):
         supports.put(state.v, supports.rates(0.0, 0.0)[0])
         if model.external.state_forces:
             model.external.follow(state.position, state.v)
-        if self.massless is not None and self.massless.settle(state.x, 0.0, 0.0) > BEYOND * model.size:
+        if self.massless is not None and self.massless.settle(model, state.x, 0.0, 0.0) > BEYOND * model.size:
             self.fault = SimulationFailure(
                 "step 0, t = 0 s: contact nodes without mass found no equilibrium; use another contact.treatment"
             )
@@ -342,7 +341,7 @@ class Stepper(ABC):
                 held = model.links.count_held(walls.nodes[walls.touching.any(axis=1)])
                 self.solution.walls, self.solution.contacts = walls, held
         if self.massless is not None:
-            state.contact, self.solution.walls = self.massless.press(state.position, load, 0.0)
+            state.contact, self.solution.walls = self.massless.press(model, state.position, load, 0.0)
             self.solution.contacts = int(self.solution.walls.touching.sum())
         if supports.any:
             inertial = model.inertia.mass_times(state.a, np.empty_like(state.a))

@@ -147,7 +147,6 @@ def test_no_room(heavy, comm, shared_tmp_path):
             {"restitution": 0.2, "integrator": "newmark"},
             "wall 'wall1' stops nodes of pairs or constraints: such a wall must be without restitution",
         ),
-        ({"mass": 2.0}, "such a wall must be without mass"),
     ],
 )
 def test_refusals(change, message, comm, shared_tmp_path):

@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from pfem_petsc.contact.projection import INFEASIBLE, JAMMED, Groups, Planes, RowPushes, System, project_groups
+from pfem_petsc.contact.projection import INFEASIBLE, JAMMED, Groups, Planes, System, project_groups
+from pfem_petsc.contact.sweeps import Pushes, RubbingRows
 
 
 def frames(normals):
@@ -73,12 +74,13 @@ class Group:
         groups = Groups(np.array([0, r]), np.arange(r), np.array([0, n]), np.arange(n))
         both = lambda mu: np.stack([mu, static * mu], axis=-1)  # noqa: E731
         weights = np.tile([-1.0, 1.0], (r, 1))
-        system = System(
-            *(self.ends, gradients, self.values, weights, both(self.friction), self.slips),
-            *(self.stiffness, self.free, self.plane),
-            Planes(self.wall_normals, self.gaps, both(self.wall_friction), self.wall_slips),
+        nowhere, soft, friction = np.empty((0, 3)), self.free / self.stiffness[:, None], both(self.friction)
+        rows = RubbingRows(
+            self.ends, weights, gradients, nowhere, self.values, self.slips, friction, soft, np.empty((0, 2))
         )
-        pushes = RowPushes(np.zeros(r), np.zeros((r, 3)), np.zeros((n, 3)))
+        planes = Planes(self.wall_normals, self.gaps, both(self.wall_friction), self.wall_slips)
+        system = System(rows, self.plane, planes)
+        pushes = Pushes(np.zeros(r), np.zeros((r, 3)), np.zeros((n, 3)))
         found = project_groups(np.array([0]), groups, system, np.full(1, 1e-13), 1.0, pushes)
         return found, pushes
 
@@ -111,7 +113,7 @@ def test_groups_as_by_another_method(seed):
     assert found == (-1, 0)
     forces, moves = group.reference()
     scale = max(1.0, np.abs(forces).max())
-    np.testing.assert_allclose(pushes.force[:, None] * group.normals + pushes.drag, forces, atol=1e-7 * scale)
+    np.testing.assert_allclose(pushes.normal[:, None] * group.normals + pushes.drag, forces, atol=1e-7 * scale)
     np.testing.assert_allclose(pushes.moves, moves, atol=1e-7 * scale)
 
 
@@ -132,16 +134,16 @@ def test_supported_groups_obey_the_law(seed):
     slips = group.slips + moved
     slips -= np.einsum("ri,ri->r", slips, n)[:, None] * n
     size, drag = np.linalg.norm(slips, axis=1), np.linalg.norm(pushes.drag, axis=1)
-    scale = max(1.0, pushes.force.max())
-    assert gaps[usable].min(initial=0.0) > -1e-9 * scale and pushes.force.min() >= 0.0
-    assert np.abs(pushes.force * gaps).max() < 1e-8 * scale
-    assert (drag <= group.friction * pushes.force + 1e-12 * scale).all()
-    slides = (pushes.force > 0.0) & (size > 1e-6)
-    against = -(group.friction * pushes.force / np.maximum(size, 1e-300))[:, None] * slips
+    scale = max(1.0, pushes.normal.max())
+    assert gaps[usable].min(initial=0.0) > -1e-9 * scale and pushes.normal.min() >= 0.0
+    assert np.abs(pushes.normal * gaps).max() < 1e-8 * scale
+    assert (drag <= group.friction * pushes.normal + 1e-12 * scale).all()
+    slides = (pushes.normal > 0.0) & (size > 1e-6)
+    against = -(group.friction * pushes.normal / np.maximum(size, 1e-300))[:, None] * slips
     np.testing.assert_allclose(pushes.drag[slides], against[slides], atol=1e-6 * scale)
     # the forces of pairs, and of nothing else at nodes without walls, move the nodes
     push = np.zeros_like(pushes.moves)
-    force = pushes.force[:, None] * n + pushes.drag
+    force = pushes.normal[:, None] * n + pushes.drag
     np.add.at(push, ends[:, 1], force)
     np.add.at(push, ends[:, 0], -force)
     alone = group.plane < 0

@@ -105,16 +105,14 @@ class Treatment(ABC):
         rates = contact.rates(x, time)
         away = np.einsum("mwi,mwi->mw", normals, rates) + self.leaving(nodes, touching, normals, rates)
         speeds = np.einsum("miw,mw->mi", inverse, away)
-        normal = inverse @ normals
+        normal, held = inverse @ normals, self.sticking(nodes, touching, normals)
         if contact.ties.any:
-            tied = contact.ties.held[nodes]
-            normal[tied] = np.eye(3)
-            speeds[tied] = rates[np.flatnonzero(tied), contact.first[contact.ties.walls(nodes[tied])]]
-        infeasible = self.sticking(nodes, touching, normals)
-        holds = infeasible.any(axis=1)
+            tied = np.flatnonzero(contact.ties.held[nodes])
+            held[tied, contact.first[contact.ties.walls(nodes[tied])]] = True
+        holds = held.any(axis=1)
         if holds.any():  # there may be pairs without any wall
             normal[holds] = np.eye(3)
-            speeds[holds] = rates[np.flatnonzero(holds), infeasible[holds].argmax(axis=1)]
+            speeds[holds] = rates[np.flatnonzero(holds), held[holds].argmax(axis=1)]
         return nodes, normal, speeds
 
     def leaving(self, nodes: np.ndarray, touching: np.ndarray, normals: np.ndarray, rates: np.ndarray) -> np.ndarray:
@@ -199,11 +197,8 @@ class Restitution(Treatment):
             force = 0.5 * links.two.apart(ends[:, :, :3])  # half the relative force between the ends
             force[force <= _NONE * links.force] = 0.0
             self._push = self._pressed & self._treated, force, links.two.apart(ends[:, :, 3:])
-        if not rebounds:
-            return
-        self._speed = state.v
-        if not scheme.explicit:
-            self._free = self._without_contact(np.arange(len(state.v)))
+        if rebounds and not scheme.explicit:
+            self._speed, self._free = state.v, self._without_contact(np.arange(len(state.v)))
 
     @property
     def _treated(self) -> np.ndarray:

@@ -38,7 +38,8 @@ _SOFTEST = 1e-4  # smallest accepted ratio between secant and elastic stiffness,
 
 @dataclass(frozen=True)
 class Redistribution:
-    """The redistributed masses of this rank.
+    """The redistributed masses of this rank. Contact nodes have none along the normals of their walls: there they are
+    in equilibrium, or on the wall.
 
     Attributes
     ----------
@@ -64,9 +65,82 @@ class Redistribution:
         """Add the product of the tensors with vectors ``u`` (owned, 3), times a factor."""
         out[self.touched] += factor * np.einsum("kij,kj->ki", self.tensors, u[self.touched])
 
-    def massless(self, model: Model) -> MasslessNodes:
-        """Return the nodes without mass of a model."""
-        return MasslessNodes(model)
+    def settle(self, model: Model, x: np.ndarray, time: float, now: float) -> float:
+        """Move nodes of ``x`` (local, 3), in place, along their normals into equilibrium or onto the wall.
+
+        Forces, walls and bars are those of ``time``; afterwards bars are reset to ``now`` [s]. Returns
+        the largest of the last moves, which is rounding of the model's length unless no equilibrium was found.
+        Collective.
+        """
+        owned, nodes, n = model.mesh.n_owned, self.nodes, self.normals
+        external, internal = np.zeros((owned, 3)), np.zeros((model.mesh.n_local, 3))
+        if model.external.active:
+            model.external.at(time, external)
+        model.change_bars(time)
+        model.mesh.update_ghosts(x)  # a scheme predicts owned nodes alone
+        elastic, farthest = self._stiffness(model, x)
+        stiffness, force, step = elastic, np.full(len(nodes), np.nan), np.zeros(len(nodes))
+        part, largest = np.ones(len(nodes)), 0.0
+        for _ in range(_ITERATIONS):
+            gap = self.gaps(model, x[:owned], time)
+            x[nodes] -= np.minimum(gap, 0.0)[:, None] * n
+            model.mesh.update_ghosts(x)
+            model.bars.forces(x, internal, commit=False)
+            last, force = force, np.einsum("mi,mi->m", external[nodes] - internal[nodes], n)
+            with np.errstate(invalid="ignore", divide="ignore"):
+                secant = (last - force) / step
+            # where bars yield or rotate, the elastic stiffness would need hundreds of moves
+            stiffness = np.where((secant > _SOFTEST * elastic) & (secant < elastic / _SOFTEST), secant, elastic)
+            swings = step * force < 0.0  # massless neighbours may push each other back and forth
+            part = np.where(swings, _CALMER * part, np.minimum(_BOLDER * part, 1.0))
+            step = np.maximum(np.clip(part * force / stiffness, -farthest, farthest), -np.maximum(gap, 0.0))
+            x[nodes] += step[:, None] * n
+            # with a bar perpendicular to the normal, forces within rounding may leave the position undetermined
+            open_way = np.minimum(np.abs(step), np.abs(force) / elastic)
+            largest = model.comm.allreduce(float(open_way.max(initial=0.0)), op=MPI.MAX)
+            if largest <= ROUNDING * model.size:
+                break
+        model.mesh.update_ghosts(x)
+        model.change_bars(now)
+        return largest
+
+    def gaps(self, model: Model, x: np.ndarray, time: float) -> np.ndarray:
+        """Return the distances (m,) of the nodes from the wall along their vectors [m]."""
+        gaps = model.contact.gaps(x[self.nodes], time, self.nodes)
+        return gaps[np.arange(len(gaps)), model.contact.wall_of[self.walls]] / self.across
+
+    def press(self, model: Model, x: np.ndarray, load: np.ndarray, time: float) -> tuple[np.ndarray, WallForces]:
+        """Return wall forces (owned, 3) that balance a load on nodes at x (owned, 3), and their sums.
+
+        The residual force on a massless node in equilibrium is the force of its wall.
+        """
+        contact, nodes = model.contact, self.nodes
+        strength = -np.einsum("mi,mi->m", load[nodes], self.normals)
+        touching = self.gaps(model, x, time) <= ON_BOUND * model.size
+        strength = np.where(touching, np.maximum(strength, 0.0), 0.0) / self.across
+        force, touched = np.zeros_like(load), np.zeros((len(nodes), len(contact.wall_of)), dtype=bool)
+        touched[np.arange(len(nodes)), self.walls] = strength > 0.0
+        each = touched[:, :, None] * (strength[:, None] * contact.surfaces.normals[self.walls])[:, None, :]
+        force[nodes] = each.sum(axis=1)
+        return force, contact.sums(nodes, each, (x[nodes], x[nodes]), touched)
+
+    def _stiffness(self, model: Model, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return stiffness (m,) of nodes along their normals at fixed neighbours [N/m], and their longest moves [m].
+
+        A bar perpendicular to the normal has geometric stiffness only, so a minimum inclination is assumed.
+        """
+        mesh = model.mesh
+        total, shortest = np.zeros(mesh.n_local), np.full(mesh.n_local, np.inf)
+        normal = np.zeros((mesh.n_local, 3))
+        normal[self.nodes] = self.normals
+        way = x[mesh.bars[:, 1]] - x[mesh.bars[:, 0]]
+        length = np.linalg.norm(way, axis=1)
+        stiffness = model.bars.of_blocks(lambda block: block.area * block.modulus) / model.bars.rest
+        for end in mesh.bars.T:
+            along = np.einsum("bi,bi->b", way, normal[end]) / length
+            np.add.at(total, end, stiffness * np.maximum(along * along, _STEEPEST))
+            np.minimum.at(shortest, end, model.bars.rest)
+        return total[self.nodes], _FARTHEST * shortest[self.nodes]
 
 
 def redistribute(model: Model) -> Redistribution:
@@ -138,94 +212,6 @@ def redistribute(model: Model) -> Redistribution:
     matrices *= movable[:, :, None] & movable[:, None, :]
     inverses = np.linalg.pinv(matrices, rcond=1e-10, hermitian=True)
     return Redistribution(nodes, walls, free, across, touched, tensors[touched], inverses)
-
-
-class MasslessNodes:
-    """Contact nodes without mass along the normals of their walls: in equilibrium, or on the wall."""
-
-    def __init__(self, model: Model) -> None:
-        self.model = model
-        self.moved = model.inertia.redistribution
-        self._force = np.zeros((model.mesh.n_local, 3))
-
-    def settle(self, x: np.ndarray, time: float, now: float) -> float:
-        """Move nodes of ``x`` (local, 3), in place, along their normals into equilibrium or onto the wall.
-
-        Forces, walls and bars are those of ``time``; afterwards bars are reset to ``now`` [s]. Returns
-        the largest of the last moves, which is rounding of the model's length unless no equilibrium was found.
-        Collective.
-        """
-        model, moved = self.model, self.moved
-        owned, nodes, n = model.mesh.n_owned, moved.nodes, moved.normals
-        external = np.zeros((owned, 3))
-        if model.external.active:
-            model.external.at(time, external)
-        model.change_bars(time)
-        model.mesh.update_ghosts(x)  # a scheme predicts owned nodes alone
-        elastic, farthest = self._stiffness(x)
-        stiffness, force, step = elastic, np.full(len(nodes), np.nan), np.zeros(len(nodes))
-        part, largest = np.ones(len(nodes)), 0.0
-        for _ in range(_ITERATIONS):
-            gap = self.gaps(x[:owned], time)
-            x[nodes] -= np.minimum(gap, 0.0)[:, None] * n
-            model.mesh.update_ghosts(x)
-            model.bars.forces(x, self._force, commit=False)
-            last, force = force, np.einsum("mi,mi->m", external[nodes] - self._force[nodes], n)
-            with np.errstate(invalid="ignore", divide="ignore"):
-                secant = (last - force) / step
-            # where bars yield or rotate, the elastic stiffness would need hundreds of moves
-            stiffness = np.where((secant > _SOFTEST * elastic) & (secant < elastic / _SOFTEST), secant, elastic)
-            swings = step * force < 0.0  # massless neighbours may push each other back and forth
-            part = np.where(swings, _CALMER * part, np.minimum(_BOLDER * part, 1.0))
-            step = np.maximum(np.clip(part * force / stiffness, -farthest, farthest), -np.maximum(gap, 0.0))
-            x[nodes] += step[:, None] * n
-            # with a bar perpendicular to the normal, forces within rounding may leave the position undetermined
-            open_way = np.minimum(np.abs(step), np.abs(force) / elastic)
-            largest = model.comm.allreduce(float(open_way.max(initial=0.0)), op=MPI.MAX)
-            if largest <= ROUNDING * model.size:
-                break
-        model.mesh.update_ghosts(x)
-        model.change_bars(now)
-        return largest
-
-    def gaps(self, x: np.ndarray, time: float) -> np.ndarray:
-        """Return the distances (m,) of the nodes from the wall along their vectors [m]."""
-        gaps = self.model.contact.gaps(x[self.moved.nodes], time, self.moved.nodes)
-        return gaps[np.arange(len(gaps)), self.model.contact.wall_of[self.moved.walls]] / self.moved.across
-
-    def press(self, x: np.ndarray, load: np.ndarray, time: float) -> tuple[np.ndarray, WallForces]:
-        """Return wall forces (owned, 3) that balance a load on nodes at x (owned, 3), and their sums.
-
-        The residual force on a massless node in equilibrium is the force of its wall.
-        """
-        moved, contact = self.moved, self.model.contact
-        n, nodes = moved.normals, moved.nodes
-        strength = -np.einsum("mi,mi->m", load[nodes], n)
-        touching = self.gaps(x, time) <= ON_BOUND * self.model.size
-        strength = np.where(touching, np.maximum(strength, 0.0), 0.0) / moved.across
-        force, touched = np.zeros_like(load), np.zeros((len(nodes), len(contact.wall_of)), dtype=bool)
-        touched[np.arange(len(nodes)), moved.walls] = strength > 0.0
-        each = touched[:, :, None] * (strength[:, None] * contact.surfaces.normals[moved.walls])[:, None, :]
-        force[nodes] = each.sum(axis=1)
-        return force, contact.sums(nodes, each, (x[nodes], x[nodes]), touched)
-
-    def _stiffness(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return stiffness (m,) of nodes along their normals at fixed neighbours [N/m], and their longest moves [m].
-
-        A bar perpendicular to the normal has geometric stiffness only, so a minimum inclination is assumed.
-        """
-        mesh, model = self.model.mesh, self.model
-        total, shortest = np.zeros(mesh.n_local), np.full(mesh.n_local, np.inf)
-        normal = np.zeros((mesh.n_local, 3))
-        normal[self.moved.nodes] = self.moved.normals
-        way = x[mesh.bars[:, 1]] - x[mesh.bars[:, 0]]
-        length = np.linalg.norm(way, axis=1)
-        stiffness = model.bars.of_blocks(lambda block: block.area * block.modulus) / model.bars.rest
-        for end in mesh.bars.T:
-            along = np.einsum("bi,bi->b", way, normal[end]) / length
-            np.add.at(total, end, stiffness * np.maximum(along * along, _STEEPEST))
-            np.minimum.at(shortest, end, model.bars.rest)
-        return total[self.moved.nodes], _FARTHEST * shortest[self.moved.nodes]
 
 
 class Treatment(Base):

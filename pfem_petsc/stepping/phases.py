@@ -27,6 +27,15 @@ SUPPORTS, LOADS, DRAGS = range(3)
 FAILED, LOST = -1, -2
 """Results of calls of Python: a failure of the simulation, any other error."""
 
+KEEPS, NEEDS_ENERGIES, HOLDS, DONE, PASSED, RECORDED, MPI_ERROR = range(7)
+CHANGED, SHORTENED, COLLAPSED, TURNED, UNSOLVED, NEAR, PRESSING = range(7, 14)
+"""Numbers of the course of a call: whether a step needs increments, and energies; whether a condition holds here, and
+after :func:`~pfem_petsc.stepping.compiled_loop.agree` on any rank; numbers of steps made, of those that other ranks
+make too, of which this one only sends messages after a failure, and of shares of rows; the error code of MPI. Of the
+last step: the number of bars that changed their state of rupture; whether bars need a look for one that has gone
+through zero length; the first bar that collapsed, and the first that went through zero length, or -1; what a call of
+Python returned; the number of nodes beyond walls or that rebound, in ContactNodes; and of nodes with contact forces."""
+
 
 @record
 class Nodes(NamedTuple):
@@ -287,7 +296,7 @@ def balancing(loaded: bool, damped: bool) -> Any:
                     forces[LOADS, c], given = _load(external[c], h, half[c], u[c])
             elif loaded:
                 power, given, forces[LOADS, c] = _advance_loaded(f[c], external[c], nodes.inverse, h, half[c], u[c])
-            elif s.course.keeps:
+            elif s.course[KEEPS] > 0:
                 power = _advance_kept(f[c], nodes.inverse, h, half[c], u[c])
             else:
                 power = _advance(f[c], nodes.inverse, h, half[c])

@@ -46,7 +46,7 @@ def test_a_balance_with_supports_and_contact_has_the_works_of_its_forces(damped,
     at, components = np.array([1, 1, 4]), np.array([0, 2, 1])
     x, before = here.x.copy(), here.half.copy()
     held = Prescribed(at, components, x[components, at] + 1e-3, *np.zeros((3, 3)), np.zeros((N, 3)))
-    s = SimpleNamespace(nodes=nodes, motion=here, held=held, sums=sums, course=SimpleNamespace(keeps=keep))
+    s = SimpleNamespace(nodes=nodes, motion=here, held=held, sums=sums, course=np.full(14, keep))
     for phase in (balancing(loaded, damped), apply_supports, react):
         getattr(phase, "py_func", phase)(s, 0)
     after = here.half

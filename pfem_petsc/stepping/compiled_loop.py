@@ -28,6 +28,7 @@ from .phases import (
     EXTERNAL,
     HOLDS,
     INERTIAL,
+    INFEASIBLE,
     INTERNAL,
     KEEPS,
     KINETIC,
@@ -50,7 +51,6 @@ from .phases import (
     StepSums,
     accumulate,
     clear_vector,
-    correct_moving_ends,
     displace,
     move,
     numerical_dissipation,
@@ -387,27 +387,19 @@ def _probed(s):
 def sum_ends(s, step):
     """Find sums at the end of a step, and write motion and forces of supports and contact at the probes."""
     accumulate(s.nodes, s.motion, s.contacts.pressing, s.sums)
-    h, motion = s.motion.h, s.motion
-    _, values = _probed(s)
+    motion, v, a, (_, values) = s.motion, s.state.v, s.state.a, _probed(s)
+    for i in s.probes:
+        rates_of(i, motion, v, a)
+    put_rates(s.moving, step, s.held, v, a)
     for k in range(len(s.probes)):
         i = s.probes[k]
         for c in range(3):
-            values[k, 0, c] = motion.x[c, i]
-            values[k, 1, c] = motion.half[c, i] - 0.5 / h * motion.u[c, i]
-            values[k, 2, c] = motion.u[c, i] / (h * h)
+            values[k, 0, c], values[k, 1, c], values[k, 2, c] = motion.x[c, i], v[i, c], a[i, c]
             values[k, 3, c] = s.held.reaction[i, c] + motion.contact[i, c]
     impulses = s.impulses
     for k in range(len(impulses.v)):
         for c in range(3):
-            impulses.v[k, c] = impulses.half[k, c] - 0.5 * h * impulses.a[k, c]
-
-
-@addressed
-def sum_moving(s, step):
-    """Correct the sums at the end of a step for supports that move."""
-    correct_moving_ends(s.moving, step, s.held, s.nodes, s.motion, s.sums, _probed(s)[1])
-    for c in range(3):
-        s.impulses.v[SUPPORT, c] += s.sums.jumps[1, c]
+            impulses.v[k, c] = impulses.half[k, c] - 0.5 * motion.h * impulses.a[k, c]
 
 
 @addressed
@@ -472,11 +464,11 @@ def run_compiled(s, phases, starts, due, flags):
     calling = (linked and not s.called.watched) or s.called_walls.massive  # which ranks do together
     agrees = several and (s.bars.can_break or calling)  # ranks that make the same steps
     keeps = flags.shape[1] > 0 or linked or calling or len(s.nodes.damping) > 0 or s.nodes.external.shape[1] > 0
-    pressed.failure[0] = course[COLLAPSED] = course[TURNED] = -1
+    course[COLLAPSED] = course[TURNED] = course[INFEASIBLE] = -1
     split_components(s.state.x, motion.x)
     split_components(s.state.half, motion.half)
     for step in range(count):
-        failed = course[COLLAPSED] >= 0 or course[TURNED] >= 0 or pressed.failure[0] >= 0
+        failed = course[COLLAPSED] >= 0 or course[TURNED] >= 0 or course[INFEASIBLE] >= 0
         if failed or (course[UNSOLVED] != 0 and not calling):
             # the other ranks still need messages, until all know of the failure
             _perform(SEND, phases, starts, s, step)
@@ -511,7 +503,7 @@ def run_compiled(s, phases, starts, due, flags):
         course[DONE] += 1
         course[PASSED] += 1
         stops = course[CHANGED] > 0
-        wrong = stops or course[COLLAPSED] >= 0 or pressed.failure[0] >= 0 or course[UNSOLVED] != 0
+        wrong = stops or course[COLLAPSED] >= 0 or course[INFEASIBLE] >= 0 or course[UNSOLVED] != 0
         wrong = wrong or not np.isfinite(sums.works[INTERNAL])
         course[HOLDS] = wrong or course[SHORTENED] > 0
         if agrees:  # whether any rank has to look at its state

@@ -55,7 +55,6 @@ from .compiled_loop import (
     set_loads,
     solve_called,
     sum_ends,
-    sum_moving,
     take_positions,
     touch_bars,
 )
@@ -72,6 +71,7 @@ from .phases import (
     CHANGED,
     COLLAPSED,
     DONE,
+    INFEASIBLE,
     MPI_ERROR,
     NEAR,
     PASSED,
@@ -79,17 +79,18 @@ from .phases import (
     RECORDED,
     TURNED,
     UNSOLVED,
+    WHY,
     GroundSprings,
     Motion,
     MovingSupports,
     Nodes,
     Prescribed,
-    accumulate_drags,
     accumulate_loads,
     add_springs,
     apply_supports,
     balancing,
     correct_moving,
+    correct_moving_ends,
     new_sums,
     place_supports,
     react,
@@ -191,8 +192,7 @@ class CompiledSteps:
         supports = self.model.supports
         motions, columns = supports.schedule(self._times(begin, count if supports.moves else -2), self.stepper.h)
         at = np.flatnonzero(columns >= 0)
-        moved, probes = np.nonzero(self._held.nodes[at][:, None] == self.stepper.probed)
-        return MovingSupports(at, columns[at], supports.origins[at], motions, np.column_stack([moved, probes]))
+        return MovingSupports(at, columns[at], supports.origins[at], motions)
 
     def _contacts(self) -> Contacts:
         """Return the contacts before the first step."""
@@ -246,9 +246,8 @@ class CompiledSteps:
             END: ((put_state, True),),
             RECORD: (
                 (sum_ends, True),
-                (accumulate_loads, loaded),
-                (accumulate_drags, damped),
-                (sum_moving, moves),
+                (accumulate_loads, loaded or damped),
+                (correct_moving_ends, moves),
                 (record_row, True),
             ),
         }
@@ -406,11 +405,11 @@ class CompiledSteps:
         stepper, pressed = self.stepper, self._pressed
         if made[COLLAPSED] >= 0 or made[TURNED] >= 0:
             return SimulationFailure(stepper.collapse(max(made[COLLAPSED], made[TURNED])))
-        infeasible, why = pressed.failure.tolist()
+        infeasible = made[INFEASIBLE]
         if infeasible >= 0:
             node, place = pressed.nodes[infeasible], pressed.places[infeasible]
             time = stepper.scheme.balance(stepper.state, stepper.h).time
-            return self._at_balance(self.model.contact.placeless(node, why, place, time))
+            return self._at_balance(self.model.contact.placeless(node, made[WHY], place, time))
         return self._at_balance(self._caller.failure) if made[UNSOLVED] else None
 
     def _at_balance(self, text: object) -> SimulationFailure:

@@ -15,7 +15,7 @@ from ..contact.surfaces import Surfaces, wall_gaps
 from ..mechanics.compiled import addressed, inlined, record
 from ..mesh.ordering import NODE_BLOCK
 from .impact import Touched, join_nodes, stop_nodes
-from .phases import clear_rows, displace, put_rates, rates_of
+from .phases import INFEASIBLE, WHY, clear_rows, displace, put_rates, rates_of
 
 PUSHED = HEAD.first("contact_work")
 
@@ -42,15 +42,13 @@ class WallArrays(NamedTuple):
 
 @record
 class ContactNodes(NamedTuple):
-    """Results of :func:`~pfem_petsc.contact.explicit.press_nodes` in a step: room for ``nodes`` (n,), the slots
-    of walls that they are ``touching`` (n, s), their ``places`` (n, 3); ``failure`` (2,): the first of them without a
-    place, or -1, and why; and the sums of each wall, ``force``
-    (w, 3), ``contacts`` (w,) and ``moment`` (w, 3)."""
+    """Results of :func:`~pfem_petsc.contact.explicit.press_nodes` in a step: room for ``nodes`` (n,), the slots of
+    walls that they are ``touching`` (n, s), their ``places`` (n, 3); and the sums of each wall, ``force`` (w, 3),
+    ``contacts`` (w,) and ``moment`` (w, 3)."""
 
     nodes: np.ndarray
     touching: np.ndarray
     places: np.ndarray
-    failure: np.ndarray
     force: np.ndarray
     contacts: np.ndarray
     moment: np.ndarray
@@ -59,10 +57,10 @@ class ContactNodes(NamedTuple):
 def new_contact_nodes(n: int, s: int, force: np.ndarray) -> ContactNodes:
     """Return room for ``n`` nodes and walls with ``s`` slots, whose ``force`` (w, 3) has its own. Pages of memory that
     no node needs are not touched."""
-    n, failure = n if len(force) else 0, np.full(2, -1, dtype=np.int64)
+    n = n if len(force) else 0
     touching, places = np.empty((n, s), dtype=bool), np.empty((n, 3))
     contacts, moment = np.zeros(len(force), dtype=np.int64), np.zeros_like(force)
-    return ContactNodes(np.empty(n, dtype=np.int64), touching, places, failure, force, contacts, moment)
+    return ContactNodes(np.empty(n, dtype=np.int64), touching, places, force, contacts, moment)
 
 
 @addressed
@@ -198,7 +196,7 @@ def press_walls(curved: Any, rough: Any, several: Any) -> Any:
                 for k in range(touching.shape[1]):
                     out.touching[j, k] = touching[j, k]
             if failed >= 0:
-                out.failure[0], out.failure[1] = failed, why
+                s.course[INFEASIBLE], s.course[WHY] = failed, why
         note_contacts(m, walls, out, contacts)
 
     return press

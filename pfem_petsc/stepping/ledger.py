@@ -327,31 +327,26 @@ class Ledger:
     def begin_compiled(self) -> None:
         """Continue the works balance by balance, after a step."""
         stepper, present, h, sums = self.stepper, self._before, self.stepper.h, self.sums
-        v, a = present.velocity, present.acceleration
-        way, half_square = (0.5 * h) * (v - (0.5 * h) * a), 0.125 * h * h * power(present.inertial, a)
-        forces = [(EXTERNAL, present.external), (CONTACT, present.contact), (DAMPING, present.damping)]
-        forces.append((INTERNAL, present.internal))
-        supports = self.model.supports
-        carried = 0.0
-        if supports.moves:  # works are over the ways between positions, and inertia is that of the motion
-            way, v, mass = way.copy(), v.copy(), self.model.inertia.mass[supports.every_node]
-            half_way = supports.get(0.5 * (stepper.state.position - stepper.before[: len(v)]))
-            centre = half_way / h + 0.5 * supports.get(stepper.state.memory["half_velocity"])
-            speed, rate = supports.get(v), supports.get(a)
-            half_square += float((mass * (0.5 * speed * speed - rate * half_way - 0.125 * h * h * rate * rate)).sum())
-            carried = h * float((mass * rate * centre).sum())
-            supports.put(way, half_way)
-            supports.put(v, centre)
-            forces.append((EXTERNAL, present.support))
+        a, supports = present.acceleration, self.model.supports
+        ahead = (0.5 * h) * stepper.state.memory["half_velocity"]  # the way of the second half of the balance
         self.powers = np.zeros(len(WORKS))
-        self.powers[EXTERNAL] = sums[_AT["external_work"]]
-        self.powers[DAMPING] = sums[_AT["damping_dissipation"]]
+        for k in (EXTERNAL, CONTACT, DAMPING, INTERNAL):
+            self.powers[k] = power(getattr(present, WORKS[k]), ahead)
+        inertial = 0.125 * h * h * power(present.inertial, a)
+        if supports.moves:  # works are over the ways between positions, and inertia is that of the motion
+            mass, speed, rate = (
+                self.model.inertia.mass[supports.every_node],
+                supports.get(present.velocity),
+                supports.get(a),
+            )
+            kinetic = 0.5 * speed * speed - 0.125 * h * h * rate * rate
+            inertial += float((mass * (kinetic + rate * supports.get(ahead))).sum())
+            self.powers[EXTERNAL] += power(present.support, ahead)
+        self.powers[EXTERNAL] += sums[_AT["external_work"]]
+        self.powers[DAMPING] += sums[_AT["damping_dissipation"]]
         impact, numerical = sums[_AT["impact_dissipation"]], sums[_AT["numerical_dissipation"]]
         rubbed = sums[_AT["friction_dissipation"]] - sums[_AT["contact_work"]]
-        self.powers[INERTIAL] = numerical + half_square + present.energy.total + impact + carried + rubbed
-        for k, force in forces:
-            if force is not stepper.zero:
-                self.powers[k] += h * power(force, v) - power(force, way)
+        self.powers[INERTIAL] = numerical + inertial + present.energy.total + impact + rubbed
         self._release()
 
     def _release(self) -> None:

@@ -124,7 +124,10 @@ class CompiledSteps:
         places, forces = model.bars.components
         self._motion = Motion(stepper.h, places, np.empty((3, n)), np.zeros((3, n)), forces, self._contact)
         self._nodes, self._held, self._walls = self._make_nodes(), self._make_held(), self._make_walls()
-        self._springs, self._at_rest = self._make_springs(), self._moving_supports(0, 0)
+        self._at_rest, ground = self._moving_supports(0, 0), model.bars.springs
+        self._springs = GroundSprings(np.empty(0, dtype=np.int64), np.empty((0, 3, 3)), np.empty((0, 3)))
+        if ground is not None:
+            self._springs = GroundSprings(ground.nodes, ground.stiffness, ground.anchors)
         # the forces on the particles of the impulses are the sums of steps, walls and rows
         impulses = self.ledger.impulses
         self._loads, rows = np.zeros_like(impulses.state.v), WALLS + impulses.n_walls
@@ -165,27 +168,12 @@ class CompiledSteps:
         contact, log, n = self.model.contact, self.model.contact.log, len(self._u)
         called = contact.called[contact.wall_of]
         surfaces = contact.surfaces._replace(radii=np.where(called, OTHER, contact.surfaces.radii))
-        at_end, level = surfaces.copy(), surfaces.copy()
         acting = self.stepper.scheme.balance(self.stepper.state, self.stepper.h).acting
-        way = np.zeros(level.centres.shape)
-        walls = contact.pressed_walls(at_end, acting, way)
+        level = surfaces.copy()
+        walls = contact.pressed_walls(surfaces.copy(), acting, np.zeros_like(level.centres))
         room = np.empty((3, n if len(contact.walls) else 0)), np.zeros(n // NODE_BLOCK + 1, dtype=bool)
-        motions = self._wall_motions(0, 0)
-        return WallArrays(
-            walls, surfaces, level, motions, self.ledger.impacts.touched, log.present, log.releases, *room
-        )
-
-    def _bars(self) -> StepBars:
-        bars = self.model.bars
-        return StepBars(
-            bars.reference, bars.loops("brief"), bars.loops("full"), bars.ends, bars.watched, bars.can_break
-        )
-
-    def _make_springs(self) -> GroundSprings:
-        springs = self.model.bars.springs
-        if springs is None:
-            return GroundSprings(np.empty(0, dtype=np.int64), np.empty((0, 3, 3)), np.empty((0, 3)))
-        return GroundSprings(springs.nodes, springs.stiffness, springs.anchors)
+        motions, touched = self._wall_motions(0, 0), self.ledger.impacts.touched
+        return WallArrays(walls, surfaces, level, motions, touched, log.present, log.releases, *room)
 
     def _moving_supports(self, begin: int, count: int) -> MovingSupports:
         """Return the supports that move in ``count`` steps from one of a number on."""
@@ -196,7 +184,8 @@ class CompiledSteps:
 
     def _contacts(self) -> Contacts:
         """Return the contacts before the first step."""
-        log, met, friction = self.model.contact.log, self.ledger.impacts.met, float(self.ledger.friction_ahead)
+        log, friction = self.model.contact.log, float(self.ledger.friction_ahead)
+        met = np.flatnonzero(log.closed.any(axis=1))
         called = self._rows.record
         others = called.held[: called.counts[HELD]].copy()
         nodes = log.last, others, np.concatenate([log.last, others])
@@ -365,7 +354,7 @@ class CompiledSteps:
     def _take(self, made: list[int], contacts: Contacts, energies: np.ndarray) -> int:
         """Take the state after the last step, with ``energies`` of the bars [J]; return how many steps are sound."""
         stepper, state, model = self.stepper, self.stepper.state, self.model
-        model.contact.log.last, self.ledger.impacts.met = contacts.touched, contacts.met
+        model.contact.log.last = contacts.touched
         state.support = self._reaction if model.supports.any else stepper.zero
         state.contact = self._contact if made[PRESSING] else stepper.zero
         if not model.external.steady:
@@ -405,17 +394,11 @@ class CompiledSteps:
         stepper, pressed = self.stepper, self._pressed
         if made[COLLAPSED] >= 0 or made[TURNED] >= 0:
             return SimulationFailure(stepper.collapse(max(made[COLLAPSED], made[TURNED])))
-        infeasible = made[INFEASIBLE]
-        if infeasible >= 0:
-            node, place = pressed.nodes[infeasible], pressed.places[infeasible]
-            time = stepper.scheme.balance(stepper.state, stepper.h).time
-            return self._at_balance(self.model.contact.placeless(node, made[WHY], place, time))
-        return self._at_balance(self._caller.failure) if made[UNSOLVED] else None
-
-    def _at_balance(self, text: object) -> SimulationFailure:
-        """Return a failure of the balance for the next positions."""
-        stepper = self.stepper
-        return SimulationFailure(f"{stepper.when(stepper.scheme.balance(stepper.state, stepper.h))}: {text}")
+        balance, at = stepper.scheme.balance(stepper.state, stepper.h), made[INFEASIBLE]
+        text: object = self._caller.failure if made[UNSOLVED] else None
+        if at >= 0:
+            text = self.model.contact.placeless(pressed.nodes[at], made[WHY], pressed.places[at], balance.time)
+        return None if text is None else SimulationFailure(f"{stepper.when(balance)}: {text}")
 
 
 def _mpi() -> tuple[CFunction, ...]:

@@ -128,19 +128,12 @@ def stop_nodes(nodes, normals, gaps, speeds, towards, touched, mass):
 
 
 class Impacts:
-    """Closing contacts of this rank's nodes, step by step.
-
-    Attributes
-    ----------
-    met : (m,) owned nodes that have touched walls and not left them yet; ``stepper.closed`` (owned, walls) marks these
-        walls
-    """
+    """Closing contacts of this rank's nodes, step by step."""
 
     def __init__(self, stepper: Stepper) -> None:
         self.stepper = stepper
         self.model = stepper.model
         contact = self.model.contact
-        self.met = np.flatnonzero(stepper.closed.any(axis=1))
         self.active = self.model.can_touch and stepper.scheme.inertial
         bodies = contact.motion.bodies
         self._counted = ~np.isin(contact.wall_of, bodies.at)
@@ -178,12 +171,10 @@ class Impacts:
         """
         if not self.active:
             return 0.0
-        loss, contact, log = 0.0, self.model.contact, self.model.contact.log
-        if contact.any and (len(self.met) or len(log.last) or contact.motion.bodies.any):
-            around, closed = join_nodes(self.met, log.last, log.present), self.stepper.closed
-            changing = around[(log.touching[around] != closed[around]).any(axis=1)]
+        loss, log = 0.0, self.model.contact.log
+        if self.model.contact.any:
+            changing = np.flatnonzero((log.touching != log.closed).any(axis=1))
             loss = self.on_walls(changing, x, motion, load, time, poses)
-            self.met = around[closed[around].any(axis=1)]
         if len(self.model.links.two.at):
             loss += self.of_rows(x, motion, load)
         return 0.0 if self.elastic else loss
@@ -219,7 +210,7 @@ class Impacts:
         self._free_rates = free.state.v
         if len(nodes) == 0 and (not free.any or self.model.comm.size == 1):
             return 0.0
-        nodes = np.sort(nodes)  # sums do not depend on when nodes met walls, which a restart does not know
+        nodes = np.sort(nodes)  # sums do not depend on when nodes met walls
         if contact.plain and not free.any:
             normals, gaps = wall_gaps(nodes, x, contact.surfaces.at(poses.shifts[contact.wall_of]))
         else:

@@ -177,10 +177,9 @@ class CompiledSteps:
 
     def _moving_supports(self, begin: int, count: int) -> MovingSupports:
         """Return the supports that move in ``count`` steps from one of a number on."""
-        supports = self.model.supports
-        motions, columns = supports.schedule(self._times(begin, count if supports.moves else -2), self.stepper.h)
-        at = np.flatnonzero(columns >= 0)
-        return MovingSupports(at, columns[at], supports.origins[at], motions)
+        supports, at = self.model.supports, np.flatnonzero(self.model.supports.columns >= 0)
+        motions = supports.schedule(self._times(begin, count if supports.moves else -2), self.stepper.h)
+        return MovingSupports(at, supports.columns[at], supports.origins[at], motions)
 
     def _contacts(self) -> Contacts:
         """Return the contacts before the first step."""

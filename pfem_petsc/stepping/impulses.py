@@ -163,8 +163,7 @@ class Impulses:
 
     def jump(self) -> None:
         """Add the velocity jumps of the treatment in this step."""
-        stepper, state = self.stepper, self.state
-        jump = stepper.treatment.jump
+        stepper, state, jump = self.stepper, self.state, self.stepper.jump
         for name, before in (("v", jump.v), ("a", jump.a), *jump.memory.items()):
             self._add(state.rates[name], jump.nodes, jump.walls, stepper.state.rates[name][jump.nodes] - before)
 

@@ -259,10 +259,12 @@ class Ledger:
         present = after = moment_of(self.stepper)
         before, self._before = self._before, after
         self.powers = None
-        jumped = 0.0
-        jump = stepper.treatment.jump if stepper.treatment is not None else None
-        if jump is not None:
-            after, jumped = self._before_jump(after)
+        jump, jumped = stepper.jump, 0.0
+        if jump is not None:  # a work of contact
+            v, a = self._before_jump()
+            inertial, damping = self.model.inertia.mass_times(a, np.empty_like(a)), damping_force(stepper, v)
+            after = replace(present, inertial=inertial, damping=damping, contact=stepper.state.contact)
+            jumped = jump.energy
         first, second = (before, after) if stepper.scheme.balance_at_endpoints else 2 * (balanced(stepper, before),)
         works = self._works(0.5 * (stepper.state.position - stepper.before[:owned]), first, second)
         self.impulses.step(self._sum_state(present, second), stepper.part)
@@ -420,16 +422,17 @@ class Ledger:
 
         With a consistent mass, where a force accelerates other nodes too, the acceleration is that before the step.
         """
-        state, balance, jump = self.stepper.state, self.stepper.balance, None
-        if self.stepper.treatment is not None:
-            jump = self.stepper.treatment.jump
-        v, a = state.v, state.a
+        balance, (v, a), earlier = self.stepper.balance, self._before_jump(), before.acceleration
+        if self.model.inertia.products:
+            return v + (balance.eta / balance.alpha) * (earlier - a), earlier
+        return v, a
+
+    def _before_jump(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return velocity and acceleration (owned, 3) before velocity jumps of the last step."""
+        jump, v, a = self.stepper.jump, self.stepper.state.v, self.stepper.state.a
         if jump is not None:
             v, a = v.copy(), a.copy()
             v[jump.nodes], a[jump.nodes] = jump.v, jump.a
-        if self.model.inertia.products:
-            earlier = before.acceleration
-            return v + (balance.eta / balance.alpha) * (earlier - a), earlier
         return v, a
 
     def _walls_before(self) -> None:
@@ -489,15 +492,6 @@ class Ledger:
         bodies = self.model.contact.motion.bodies
         self._bodies = bodies.motion
         self.sums[_AT["wall_kinetic_energy"]] = bodies.kinetic if self.model.comm.rank == 0 else 0.0
-
-    def _before_jump(self, after: Moment) -> tuple[Moment, float]:
-        """Return the end of the step before velocity jumps, and the energy of the jumps [J], a work of contact."""
-        stepper, inertia = self.stepper, self.model.inertia
-        jump = stepper.treatment.jump
-        a, v = after.acceleration.copy(), after.velocity.copy()
-        a[jump.nodes], v[jump.nodes] = jump.a, jump.v
-        inertial, damping = inertia.mass_times(a, np.empty_like(a)), damping_force(stepper, v)
-        return replace(after, inertial=inertial, damping=damping, contact=stepper.state.contact), jump.energy
 
     def follow_removal(self) -> None:
         """Start the next step from the energies and stresses of the bars after some were removed, as a restart does."""

@@ -26,6 +26,7 @@ from ..tolerances import BEYOND, ON_BOUND, TIME
 from .bar_events import Collapse, Removals, Ruptures, collapse_message
 
 if TYPE_CHECKING:
+    from ..contact.treatments.base import Jump
     from .model import Model
 
 
@@ -435,6 +436,11 @@ class Stepper(ABC):
         """A step and a time of the stage as they are counted in the results, for messages."""
         place = AXIS.exact(self.model.origin + time) if self.scheme.inertial else LOAD_FACTOR.exact(time)
         return f"step {self.model.first_step + step}, {place}"
+
+    @property
+    def jump(self) -> Jump | None:
+        """Velocity jumps of the treatment in the last part; None if there were none."""
+        return None if self.treatment is None else self.treatment.jump
 
     @property
     def number(self) -> int:

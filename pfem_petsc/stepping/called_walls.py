@@ -12,7 +12,7 @@ from ..contact.surfaces import OTHER, Surfaces, tangent
 from ..mechanics.compiled import addressed, inlined, record
 from ..tolerances import BEYOND
 from .contact_phase import PUSHED, find_beyond, note_contacts
-from .impact import join_nodes
+from .impact import closed_nodes, join_nodes
 from .phases import LOST, UNSOLVED, displace, put_rates, rates_of
 
 if TYPE_CHECKING:
@@ -176,7 +176,7 @@ def close_on_called(s, step):
     contacts, touched, called, state = s.contacts, s.walls.touched, s.called_walls, s.state
     if len(contacts.met) == 0 and len(contacts.touched) == 0 and not called.massive:
         return
-    around, m, count = join_nodes(contacts.met, contacts.touched, s.walls.present), 0, 0
+    around, m = join_nodes(contacts.met, contacts.touched, s.walls.present), 0
     for i in around:
         changes = False
         for k in range(touched.closed.shape[1]):
@@ -194,11 +194,7 @@ def close_on_called(s, step):
             s.course[UNSOLVED] = LOST
             return
         contacts.impact += called.losses[1]
-    for i in around:
-        if touched.closed[i].any():
-            around[count] = i
-            count += 1
-    contacts.met = around[:count].copy()
+    contacts.met = closed_nodes(around, touched)
 
 
 @addressed

@@ -30,7 +30,6 @@ from .phases import (
     INERTIAL,
     INFEASIBLE,
     INTERNAL,
-    KEEPS,
     KINETIC,
     LOST,
     MPI_ERROR,
@@ -56,7 +55,6 @@ from .phases import (
     numerical_dissipation,
     put_rates,
     rates_of,
-    restore_increments,
     work_of_contact,
 )
 
@@ -436,8 +434,6 @@ def record_row(s, step):
 def put_state(s, step):
     """Write the state at the end of a step: velocities and accelerations by the scheme alone, or of supports."""
     state, motion, h = s.state, s.motion, s.motion.h
-    if s.course[KEEPS] == 0:
-        restore_increments(s.nodes, motion, s.held)
     join_components(motion.x, state.x)
     join_components(motion.f, state.f)
     join_components(motion.half, state.half)
@@ -463,7 +459,6 @@ def run_compiled(s, phases, starts, due, flags):
     count, several, linked = len(due), s.messages.several, s.called.any
     calling = (linked and not s.called.watched) or s.called_walls.massive  # which ranks do together
     agrees = several and (s.bars.can_break or calling)  # ranks that make the same steps
-    keeps = flags.shape[1] > 0 or linked or calling or len(s.nodes.damping) > 0 or s.nodes.external.shape[1] > 0
     course[COLLAPSED] = course[TURNED] = course[INFEASIBLE] = -1
     split_components(s.state.x, motion.x)
     split_components(s.state.half, motion.half)
@@ -489,7 +484,6 @@ def run_compiled(s, phases, starts, due, flags):
         if course[MPI_ERROR] != 0:
             break
         _perform(TAKE, phases, starts, s, step)
-        course[KEEPS] = keeps or ending
         course[NEEDS_ENERGIES] = ending or s.bars.can_break  # a bar that breaks ends the steps
         _perform(FORCES, phases, starts, s, step)
         _perform(PRESS, phases, starts, s, step)

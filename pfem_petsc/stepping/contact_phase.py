@@ -14,7 +14,7 @@ from ..contact.node_walls import compare_contacts
 from ..contact.surfaces import Surfaces, wall_gaps
 from ..mechanics.compiled import addressed, inlined, record
 from ..mesh.ordering import NODE_BLOCK
-from .impact import Touched, join_nodes, stop_nodes
+from .impact import Touched, closed_nodes, join_nodes, stop_nodes
 from .phases import INFEASIBLE, WHY, clear_rows, displace, put_rates, rates_of
 
 PUSHED = HEAD.first("contact_work")
@@ -225,5 +225,5 @@ def close_on_walls(s, step):
                 rate = walls.motions[step + 1, 1, k, c] if moves else 0.0
                 speeds[j, k] += normals[j, k, c] * (free_v - rate)
                 towards[j, k] -= normals[j, k, c] * free_a
-    loss, contacts.met = stop_nodes(around, normals, gaps, speeds, towards, walls.touched, s.nodes.mass)
-    contacts.impact += loss
+    contacts.impact += stop_nodes(around, normals, gaps, speeds, towards, walls.touched, s.nodes.mass)
+    contacts.met = closed_nodes(around, walls.touched)

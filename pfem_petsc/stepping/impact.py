@@ -8,7 +8,6 @@ import numpy as np
 from mpi4py import MPI
 
 from ..contact.fixed_rows import close_rows
-from ..contact.surfaces import wall_gaps
 from ..mechanics.compiled import kernel, record
 from ..tolerances import ON_BOUND
 
@@ -58,8 +57,19 @@ class Touched(NamedTuple):
 
 
 @kernel
+def closed_nodes(nodes, touched):
+    """Return those nodes that are on walls or have not left them yet."""
+    found, count = np.empty_like(nodes), 0
+    for i in nodes:
+        if touched.closed[i].any():
+            found[count] = i
+            count += 1
+    return found[:count].copy()
+
+
+@kernel
 def stop_nodes(nodes, normals, gaps, speeds, towards, touched, mass):
-    """Return the energy [J] that nodes (m,) lose when they close on walls, and the nodes that are on walls afterwards.
+    """Mark contacts of nodes (m,) that have closed or opened, and return the energy [J] that they lose by closing.
 
     Parameters
     ----------
@@ -73,8 +83,6 @@ def stop_nodes(nodes, normals, gaps, speeds, towards, touched, mass):
     touching, closed, fixed = touched.touching, touched.closed, touched.fixed
     restitution, counted, slack = touched.restitution, touched.counted, touched.slack
     w = closed.shape[1]
-    met = np.empty(len(nodes), dtype=np.int64)
-    count = 0
     loss = 0.0
     basis = np.empty((3, 3))
     row = np.empty(3)
@@ -82,7 +90,6 @@ def stop_nodes(nodes, normals, gaps, speeds, towards, touched, mass):
     for j in range(len(nodes)):
         i = nodes[j]
         fresh = False
-        here = False
         for k in range(w):
             speed, speeds[j, k] = speeds[j, k], 0.0
             if touching[i, k]:
@@ -94,10 +101,6 @@ def stop_nodes(nodes, normals, gaps, speeds, towards, touched, mass):
                         fresh = fresh or counted[k]
             elif closed[i, k] and gaps[j, k] > slack:
                 closed[i, k] = False
-            here = here or closed[i, k]
-        if here:
-            met[count] = i
-            count += 1
         if not fresh:
             continue
         # the minimum-norm velocity with these components along the normals, from an orthogonal basis of their span
@@ -124,7 +127,7 @@ def stop_nodes(nodes, normals, gaps, speeds, towards, touched, mass):
                 size += 1
         for b in range(size):
             loss += 0.5 * mass[i] * (before[b] * before[b] - after[b] * after[b])
-    return loss, met[:count].copy()
+    return loss
 
 
 class Impacts:
@@ -211,11 +214,8 @@ class Impacts:
         if len(nodes) == 0 and (not free.any or self.model.comm.size == 1):
             return 0.0
         nodes = np.sort(nodes)  # sums do not depend on when nodes met walls
-        if contact.plain and not free.any:
-            normals, gaps = wall_gaps(nodes, x, contact.surfaces.at(poses.shifts[contact.wall_of]))
-        else:
-            every = np.ones((len(nodes), len(contact.wall_of)), dtype=bool)
-            normals, gaps = contact.distances(every, x[nodes], poses, nodes)
+        every = np.ones((len(nodes), len(contact.wall_of)), dtype=bool)
+        normals, gaps = contact.distances(every, x[nodes], poses, nodes)
         free_v, free_a = self._free(nodes, motion, load)
         rates = contact.rates(x[nodes], time, ahead=True)
         pulls = np.zeros((len(contact.names), 3))
@@ -227,7 +227,7 @@ class Impacts:
             rates = rates + unpushed[:, contact.wall_of]
         relative = free_v[:, None, :] - rates, pulls[contact.wall_of] - free_a[:, None, :]
         speeds, towards = (np.einsum("mwc,mwc->mw", normals, each, order="C") for each in relative)
-        loss, _ = stop_nodes(nodes, normals, gaps, speeds, towards, self.touched, self.model.inertia.mass)
+        loss = stop_nodes(nodes, normals, gaps, speeds, towards, self.touched, self.model.inertia.mass)
         if contact.ties.any:
             loss += self._tied(nodes, normals, speeds, free_v, rates)
         if free.any:

@@ -27,15 +27,15 @@ SUPPORTS, LOADS, DRAGS = range(3)
 FAILED, LOST = -1, -2
 """Results of calls of Python: a failure of the simulation, any other error."""
 
-KEEPS, NEEDS_ENERGIES, HOLDS, DONE, PASSED, RECORDED, MPI_ERROR = range(7)
-CHANGED, SHORTENED, COLLAPSED, TURNED, INFEASIBLE, WHY, UNSOLVED, NEAR, PRESSING = range(7, 16)
-"""Numbers of the course of a call: whether a step needs increments, and energies; whether a condition holds here, and
-after :func:`~pfem_petsc.stepping.compiled_loop.agree` on any rank; numbers of steps made, of those that other ranks
-make too, of which this one only sends messages after a failure, and of shares of rows; the error code of MPI. Of the
-last step: the number of bars that changed their state of rupture; whether bars need a look for one that has gone
-through zero length; the first bar that collapsed, the first that went through zero length, and the first node of
-ContactNodes that walls leave no place, or -1, and why; what a call of Python returned; the number of nodes beyond walls
-or that rebound, in ContactNodes; and of nodes with contact forces."""
+NEEDS_ENERGIES, HOLDS, DONE, PASSED, RECORDED, MPI_ERROR = range(6)
+CHANGED, SHORTENED, COLLAPSED, TURNED, INFEASIBLE, WHY, UNSOLVED, NEAR, PRESSING = range(6, 15)
+"""Numbers of the course of a call: whether a step needs energies; whether a condition holds here, and after
+:func:`~pfem_petsc.stepping.compiled_loop.agree` on any rank; numbers of steps made, of those that other ranks make too,
+of which this one only sends messages after a failure, and of shares of rows; the error code of MPI. Of the last step:
+the number of bars that changed their state of rupture; whether bars need a look for one that has gone through zero
+length; the first bar that collapsed, the first that went through zero length, and the first node of ContactNodes that
+walls leave no place, or -1, and why; what a call of Python returned; the number of nodes beyond walls or that rebound,
+in ContactNodes; and of nodes with contact forces."""
 
 
 @record
@@ -59,7 +59,7 @@ class Nodes(NamedTuple):
 @record
 class Motion(NamedTuple):
     """What moves: the step h [s]; positions and internal forces of local nodes, (3, stride); of owned nodes velocities
-    at half steps, and increments, which are written in steps that need them, (3, n); and contact forces (n, 3)."""
+    at half steps, and increments, (3, n); and contact forces (n, 3)."""
 
     h: float
     x: np.ndarray
@@ -202,17 +202,15 @@ def place_supports(s, step):
 @inlined
 def _advance(f, external, inverse, h, half, u):
     """Solve the balances of a component with the forces of bars and loads, None for none, advance ``half``, and write
-    the increments, unless ``u`` is None; return the powers of both, and the sum of the loads."""
+    the increments; return the powers of both, and the sum of the loads."""
     rate, eta, power, given, total = 1.0 / h, 0.5 / h, 0.0, 0.0, 0.0
     for i in range(len(half)):
         force = -f[i]
         if external is not None:
             force += external[i]
-        increment = force * inverse[i]
-        if u is not None:
-            u[i] = increment
-        half[i] += rate * increment
-        v = half[i] - eta * increment
+        u[i] = force * inverse[i]
+        half[i] += rate * u[i]
+        v = half[i] - eta * u[i]
         power = add_freely(power, f[i] * v)
         if external is not None:
             given = add_freely(given, external[i] * v)
@@ -259,7 +257,7 @@ def _load(external, h, half, u):
 @cache
 def balancing(loaded: bool, damped: bool) -> Any:
     """Make the phase that solves the balances of all nodes without supports and contact, and begins the sums of the
-    step; increments are written in steps that need them, and always with loads or dampers."""
+    step."""
 
     @addressed
     def balance(s, step):
@@ -280,10 +278,8 @@ def balancing(loaded: bool, damped: bool) -> Any:
                     forces[LOADS, c], given = _load(external[c], h, half[c], u[c])
             elif loaded:
                 power, given, forces[LOADS, c] = _advance(f[c], external[c], nodes.inverse, h, half[c], u[c])
-            elif s.course[KEEPS] > 0:
-                power, _, _ = _advance(f[c], None, nodes.inverse, h, half[c], u[c])
             else:
-                power, _, _ = _advance(f[c], None, nodes.inverse, h, half[c], None)
+                power, _, _ = _advance(f[c], None, nodes.inverse, h, half[c], u[c])
             works[INTERNAL] += h * power
             works[EXTERNAL] += h * given
 
@@ -345,16 +341,6 @@ def work_of_contact(touched, motion, sums):
         for c in range(3):
             power += motion.contact[i, c] * (motion.half[c, i] - 0.5 / h * motion.u[c, i])
     sums.works[CONTACT] += h * power
-
-
-@inlined
-def restore_increments(nodes, motion, held):
-    """Write the increments of a step that has not kept them, which has neither loads nor dampers nor contact."""
-    for c in range(3):
-        for i in range(len(nodes.inverse)):
-            motion.u[c, i] = -motion.f[c, i] * nodes.inverse[i]
-    for k in range(len(held.nodes)):
-        motion.u[held.components[k], held.nodes[k]] = held.u[k]
 
 
 @inlined

@@ -298,8 +298,6 @@ class Stepper(ABC):
         supports = model.supports
         supports.place(state.position, supports.positions(0.0))
         supports.put(state.v, supports.rates(0.0, 0.0)[0])
-        if model.external.state_forces:
-            model.external.follow(state.position, state.v)
         if self.massless is not None and self.massless.settle(state.x, 0.0, 0.0) > BEYOND * model.size:
             self.fault = SimulationFailure(
                 "step 0, t = 0 s: contact nodes without mass found no equilibrium; use another contact.treatment"

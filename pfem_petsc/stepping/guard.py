@@ -43,6 +43,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from mpi4py import MPI
 
+from ..mechanics.compiled import kernel
 from ..solvers.matrix import largest_distance
 
 if TYPE_CHECKING:
@@ -68,6 +69,39 @@ _SOLVED = 1e-8  # reduction of the residual, squared
 def _vectors(bars: np.ndarray, x: np.ndarray) -> np.ndarray:
     """Return the vectors (b, 3) from first to second ends of bars at positions (local, 3) [m]."""
     return x[bars[:, 1]] - x[bars[:, 0]]
+
+
+@kernel
+def _largest_miss(bars, rest, before, after, predicted):
+    """Largest change of a bar's vector that is not predicted, over its rest length, and the number of that bar."""
+    worst, at = -1.0, 0
+    for k in range(len(bars)):
+        a, b = bars[k, 0], bars[k, 1]
+        changed = missed = 0.0
+        for c in range(3):
+            end = after[b, c] - after[a, c]
+            changed += (end - (before[b, c] - before[a, c])) ** 2
+            missed += (end - (predicted[b, c] - predicted[a, c])) ** 2
+        value = np.sqrt(min(changed, missed)) / rest[k] if rest[k] > 0.0 else 0.0  # a bar that has left the model
+        if not value <= worst:
+            worst, at = value, k
+            if value != value:  # what is not a number is the worst of all
+                break
+    return worst, at
+
+
+@kernel
+def _pull(bars, axes, stiffness, lacking, w, out):
+    """Add to ``out`` the forces on nodes (n, 3) by bars of some ``stiffness`` (b,) with directions ``axes`` (b, 3) that
+    lack lengths (b,) and turn by displacements w (n, 3)."""
+    for k in range(len(bars)):
+        a, b, along = bars[k, 0], bars[k, 1], -lacking[k]
+        for c in range(3):
+            along += axes[k, c] * (w[b, c] - w[a, c])
+        for c in range(3):
+            force = stiffness[k] * (along * axes[k, c] + SIDEWAYS * (w[b, c] - w[a, c]))
+            out[a, c] += force
+            out[b, c] -= force
 
 
 class StepGuard:
@@ -121,17 +155,13 @@ class StepGuard:
         watched = self.model.bars.watched
         if 2.0 * largest_distance(after, self._predicted) <= NOTICEABLE * watched.min():  # the ends of any bar
             return 0.0, -1, (-1, -1), 0.0, 0.0
-        start, end, expected = (_vectors(mesh.bars, x) for x in (before, after, self._predicted))
-        missed = np.minimum(np.linalg.norm(end - start, axis=1), np.linalg.norm(end - expected, axis=1))
-        # bars that have left the model have no length; what is not a number is the worst of all
-        values = np.divide(missed, watched, out=np.full(len(missed), -1.0), where=watched > 0.0)
-        k = int(values.argmax())
-        start, end = start[k], end[k]
+        value, k = _largest_miss(mesh.bars, watched, before, after, self._predicted)
+        start, end = (_vectors(mesh.bars[k : k + 1], x)[0] for x in (before, after))
         lengths = np.linalg.norm(start) * np.linalg.norm(end)
         turn = np.degrees(np.arccos(np.clip(start @ end / max(lengths, 1e-300), -1.0, 1.0)))
         nodes = int(mesh.node_ids[mesh.bars[k, 0]]), int(mesh.node_ids[mesh.bars[k, 1]])
         change = float(np.linalg.norm(end - start) / rest[k])
-        return float(values[k]), int(mesh.bar_ids[k]), nodes, change, float(turn)
+        return float(value), int(mesh.bar_ids[k]), nodes, change, float(turn)
 
     def _barrier(self, before: np.ndarray, after: np.ndarray, energy: float) -> str | None:
         """Check energies of bars at both ends and at mid-path, with the initial internal variables. Collective."""
@@ -174,7 +204,7 @@ class StepGuard:
         owned = model.mesh.n_owned
         axes = _vectors(bars, middle)
         lengths, *ends = (np.linalg.norm(_vectors(bars, x), axis=1) for x in (middle, before, after))
-        lacking, stiffness = 0.5 * (ends[0] + ends[1]) - lengths, model.bars.stiffness[:, None]
+        lacking = 0.5 * (ends[0] + ends[1]) - lengths
         axes /= np.maximum(lengths, 1e-300)[:, None]
         push = model.contact.state.contact
         held = np.linalg.norm(push, axis=1, keepdims=True)
@@ -185,12 +215,8 @@ class StepGuard:
             shift = np.zeros_like(middle)
             shift[:owned] = w
             model.mesh.update_ghosts(shift)
-            turned = _vectors(bars, shift)
-            along = (axes * turned).sum(axis=1) - lacking
-            pulls = stiffness * (along[:, None] * axes + SIDEWAYS * turned)
             out = np.zeros_like(middle)
-            np.add.at(out, bars[:, 0], pulls)
-            np.subtract.at(out, bars[:, 1], pulls)
+            _pull(bars, axes, model.bars.stiffness, lacking, shift, out)
             free = out[:owned]
             free -= push * (free * push).sum(axis=1, keepdims=True)
             model.supports.clear(free)

@@ -52,6 +52,11 @@ class State:
         """(owned, 3) view of the positions of owned nodes [m]."""
         return self.x[: len(self.v)]
 
+    @property
+    def rates(self) -> dict[str, np.ndarray]:
+        """Velocity, acceleration and memory by name."""
+        return {"v": self.v, "a": self.a, **self.memory}
+
 
 @dataclass
 class Balance:
@@ -130,6 +135,10 @@ class Scheme(ABC):
 
     def __init__(self, parameters: StrictModel) -> None:
         self.parameters = parameters
+        self.set_coefficients()
+
+    def set_coefficients(self) -> None:
+        """Set what follows from the parameters; nothing by default."""
 
     @property
     def rates_follow(self) -> bool:

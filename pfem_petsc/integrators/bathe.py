@@ -42,9 +42,9 @@ class Scheme(Base):
 
     remembers = _MEMORY
 
-    def __init__(self, parameters: StrictModel) -> None:
-        super().__init__(parameters)
-        rho = parameters.rho_inf
+    def set_coefficients(self) -> None:
+        """Set shares of the substeps and weights from the parameter."""
+        rho = self.parameters.rho_inf
         first = 0.5 if rho == 1.0 else (2.0 - np.sqrt(2.0 + 2.0 * rho)) / (1.0 - rho)
         q1 = (rho + 1.0) / (2.0 * first * (rho - 1.0) + 4.0)
         q2 = 0.5 - first * q1

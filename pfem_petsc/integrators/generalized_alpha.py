@@ -34,10 +34,6 @@ class Scheme(Base):
 
     balance_at_endpoints = False
 
-    def __init__(self, parameters: StrictModel) -> None:
-        super().__init__(parameters)
-        self.set_coefficients()
-
     def set_coefficients(self) -> None:
         """Set alpha_m, alpha_f, beta, gamma from the parameters."""
         rho = self.parameters.rho_inf

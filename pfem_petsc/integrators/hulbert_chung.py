@@ -10,11 +10,11 @@ from __future__ import annotations
 
 from typing import Annotated
 
-import numpy as np
 from pydantic import Field
 
 from ..case.base import StrictModel
 from .base import Balance, ExplicitScheme, State, lagged_limit
+from .generalized_alpha import Scheme as GeneralisedAlpha
 
 __all__ = ["Parameters", "Scheme"]
 
@@ -30,10 +30,6 @@ class Scheme(ExplicitScheme):
     """Explicit generalised-alpha (Hulbert and Chung)."""
 
     balance_at_endpoints = False
-
-    def __init__(self, parameters: StrictModel) -> None:
-        super().__init__(parameters)
-        self.set_coefficients()
 
     def set_coefficients(self) -> None:
         """Set alpha_m, beta, gamma from the parameters."""
@@ -58,8 +54,4 @@ class Scheme(ExplicitScheme):
             weight=0.0,
         )
 
-    def finish(self, state: State, balance: Balance, u: np.ndarray, h: float) -> None:
-        state.position[:] = balance.predictor + u
-        a = u / (self.beta * h * h)
-        state.v = state.v + h * ((1.0 - self.gamma) * state.a + self.gamma * a)
-        state.a = a
+    finish = GeneralisedAlpha.finish  # by the same formulas of Newmark

@@ -41,9 +41,9 @@ class Scheme(ExplicitScheme):
     jumps_known = False  # which of the two velocities jumps, and when, is not known
     remembers = ("half_velocity", "first_known", "second_known")
 
-    def __init__(self, parameters: StrictModel) -> None:
-        super().__init__(parameters)
-        p = parameters.p
+    def set_coefficients(self) -> None:
+        """Set shares of the substeps and weights from the parameter."""
+        p = self.parameters.p
         q1 = (1.0 - 2.0 * p) / (2.0 * p * (1.0 - p))
         self.last_weight = 0.5 - p * q1
         self.weights = 0.5 - q1 - self.last_weight, 0.5 + q1

@@ -44,13 +44,13 @@ class LoadSchedule(NamedTuple):
     Attributes
     ----------
     gravity : (steps, 3) [m/s2]; (0, 3) if neither loads nor gravity vary
-    varies : whether gravity does
+    nodes : (k,) whose forces vary: all if gravity does, else those with loads
     values : (steps, k) of tables, and 1 for forces without one
     first, members, forces, columns : arguments of :func:`_add_forces`
     """
 
     gravity: np.ndarray
-    varies: bool
+    nodes: np.ndarray
     values: np.ndarray
     first: np.ndarray
     members: np.ndarray
@@ -59,22 +59,15 @@ class LoadSchedule(NamedTuple):
 
 
 _NONE = np.empty(0, dtype=np.int64)
-_CONSTANT = LoadSchedule(np.empty((0, 3)), False, np.empty((0, 1)), _NONE, _NONE, np.empty((0, 3)), _NONE)
+_CONSTANT = LoadSchedule(np.empty((0, 3)), _NONE, np.empty((0, 1)), _NONE, _NONE, np.empty((0, 3)), _NONE)
 
 
 @kernel
 def set_forces(step, loads, mass, out):
-    """Write the forces (n, 3) [N] at a step of a :class:`LoadSchedule`; of constant gravity it has written before, only
-    those of nodes with loads are written."""
-    gravity = loads.gravity
-    if loads.varies:
-        for i in range(len(mass)):
-            for c in range(3):
-                out[i, c] = mass[i] * gravity[step, c]
-    else:
-        for i in loads.members:
-            for c in range(3):
-                out[i, c] = mass[i] * gravity[step, c]
+    """Write the forces (n, 3) [N] at a step of a :class:`LoadSchedule`, of the nodes where it has written others."""
+    for i in loads.nodes:
+        for c in range(3):
+            out[i, c] = mass[i] * loads.gravity[step, c]
     _add_forces(loads.first, loads.members, loads.forces, loads.columns, loads.values[step], out)
 
 
@@ -362,7 +355,9 @@ class ExternalForce:
         times = [step * h for step in steps]
         gravity = np.array([self.gravity_at(time) for time in times])
         values = np.array([self._loads.values(time, 1.0).copy() for time in times])
-        return LoadSchedule(gravity, self.gravity_varies, values, *self._loads.arguments)
+        first, members, forces, columns = self._loads.arguments
+        nodes = np.arange(len(self.inertia.mass)) if self.gravity_varies else members
+        return LoadSchedule(gravity, nodes, values, first, members, forces, columns)
 
     def call(self, function: Callable[[float, ForceState], Any]) -> None:
         """Add the forces that a function returns."""

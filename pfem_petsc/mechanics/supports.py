@@ -183,6 +183,7 @@ class Supports:
     at : (nodes, components), an index into arrays (owned, 3)
     nodes, components : (a,) indices of the prescribed components along axes, sorted by node
     origins : (a,) positions from which their displacements count [m]
+    columns : (a,) of these components in what :meth:`schedule` returns, -1 for those at rest
     inclined : Directions of the nodes with others; None if the whole model has none
     """
 
@@ -272,12 +273,12 @@ class Supports:
         self.nodes, self.components = map(np.ascontiguousarray, np.nonzero(self.fixed))
         self.at = (self.nodes, self.components)
         self.origins = self._origin[self.at]
-        by = first[self.at]
-        self._moved = [  # each motion, and for each axis the places of its components among those prescribed
-            (each.motion, [np.flatnonzero((by == k) & (self.components == axis)) for axis in range(3)])
-            for k, (_, each) in enumerate(self._all)
-            if each.motion is not None
-        ]
+        moves = [k for k, (_, each) in enumerate(self._all) if each.motion is not None]
+        self._motions = [self._all[k][1].motion for k in moves]
+        begins = np.full(len(self._all) + 1, -1)  # of the columns of each support; the last one is no support
+        begins[moves] = 3 * np.arange(len(moves))
+        own = begins[first[self.at]]
+        self.columns = np.where(own >= 0, own + self.components, -1)
         return first
 
     @property
@@ -301,7 +302,7 @@ class Supports:
 
     def positions(self, time: float) -> np.ndarray:
         """Return prescribed :meth:`coordinates` (k,) [m] at a time [s]."""
-        if not self._moved and self.inclined is None:
+        if not self._motions and self.inclined is None:
             return self.origins
         return self._joined(self.origins, 0.0) + self._at(time, 0.0)[0]
 
@@ -317,23 +318,15 @@ class Supports:
         """
         return tuple(self._at(time, span)[1:])
 
-    def schedule(self, times: np.ndarray, span: float) -> tuple[np.ndarray, np.ndarray]:
+    def schedule(self, times: np.ndarray, span: float) -> np.ndarray:
         """Return the displacements [m], velocities [m/s] and accelerations [m/s2] of all m motions along axes at times
-        (t,) [s], (t, 3, 3 m); and the column of each prescribed component (a,) there, -1 for those at rest. ``span``:
-        see :meth:`rates`."""
-        columns = np.full(len(self.nodes), -1)
-        for k, (_, places) in enumerate(self._moved):
-            for axis, of_axis in enumerate(places):
-                columns[of_axis] = 3 * k + axis
-        moved = [motion.at(times, span) for motion, _ in self._moved]
-        return np.concatenate([np.zeros((len(times), 3, 0)), *moved], axis=2), columns
+        (t,) [s], (t, 3, 3 m), see :attr:`columns`. ``span``: see :meth:`rates`."""
+        moved = [motion.at(times, span) for motion in self._motions]
+        return np.concatenate([np.zeros((len(times), 3, 0)), *moved], axis=2)
 
     def _at(self, time: float, span: float) -> np.ndarray:
-        along_axes = np.zeros((3, len(self.nodes)))  # displacements, velocities, accelerations
-        for motion, places in self._moved:
-            moved = motion.at(time, span)
-            for axis, of_axis in enumerate(places):
-                along_axes[:, of_axis] = moved[:, axis, None]
+        along_axes, moved = np.zeros((3, len(self.nodes))), self.columns >= 0
+        along_axes[:, moved] = self.schedule(np.array([time]), span)[0][:, self.columns[moved]]
         if self.inclined is None:
             return along_axes
         return np.concatenate([along_axes, self.inclined.displacements(time, span)], axis=1)

@@ -153,11 +153,11 @@ class ForceDensityStepper(StaticStepper):
             part = slice(block.start, block.stop)
             self.model.rest_lengths.take(part, rest[part].copy())
 
-    def _account(self, end: float) -> None:
+    def _account(self) -> None:
         """Update the ledger: what the bars have gained is the work of their prestress, whatever the way there."""
         ledger = self.ledger
         before = None if ledger is None else ledger.sums[_DISSIPATED]
-        super()._account(end)
+        super()._account()
         if ledger is not None:
             ledger.sums[_STRESSING] -= ledger.sums[_DISSIPATED] - before
             ledger.sums[_DISSIPATED] = before

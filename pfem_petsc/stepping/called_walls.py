@@ -12,15 +12,15 @@ from ..contact.surfaces import OTHER, Surfaces, tangent
 from ..mechanics.compiled import addressed, inlined, record
 from ..tolerances import BEYOND
 from .contact_phase import PUSHED, find_beyond, note_contacts
-from .impact import join_nodes
-from .phases import LOST, displace, put_rates, rates_of
+from .impact import closed_nodes, join_nodes
+from .phases import LOST, UNSOLVED, displace, put_rates, rates_of
 
 if TYPE_CHECKING:
     from ..contact.contact import Contact
 
-MOVED, PRESSED, STOPPED = range(3)
-"""What a call of Python does: begin the step of walls with mass, press nodes, or find the energy that they lose and end
-the step of walls with mass."""
+SOLVE, CLOSE, TOUCH, MOVE, PRESS, STOP = range(6)
+"""What a call of Python does: solve rows, find the energy that they lose, add the forces of bars that touch; begin the
+step of walls with mass, press nodes, or find the energy that they lose and end the step of walls with mass."""
 
 AGAIN = 1
 """What a call returns if walls with mass may meet more nodes than those found."""
@@ -42,7 +42,8 @@ class CalledWalls(NamedTuple):
         in a step, zero for others; pivots : (w, 3) their centres without contact at its end [m]
     poses, angles : (t, w, 12) and (t, w) [rad], see :meth:`~pfem_petsc.contact.wall_motion.WallMotion.turns`, at the
         start of the first step, the end of each, and of one more
-    axes, centres : (w, 3) about which walls turn; torques : (w,) at the start of a step [N m]
+    axes, centres : (w, 3) about which walls turn; torques : (w, 3) at the start of a step, first components [N m]; (0,
+        3) if none turns
     counts : (2,) numbers of nodes that are known to be beyond walls, and of others in ``nodes`` (n,)
     free : (n, 3) positions to which nodes move [m]
     force : (n, 3) on pressed nodes [N]
@@ -69,8 +70,8 @@ class CalledWalls(NamedTuple):
     losses: np.ndarray
 
 
-def new_called_walls(contact: Contact) -> CalledWalls:
-    """Return the walls of a rank."""
+def new_called_walls(contact: Contact, torques: np.ndarray) -> CalledWalls:
+    """Return the walls of a rank, with room for their ``torques``."""
     w, called = len(contact.walls), contact.called
     n = len(contact.members) if called.any() else 0
     boxes = np.zeros((w, 6))
@@ -81,7 +82,7 @@ def new_called_walls(contact: Contact) -> CalledWalls:
     times = np.zeros((0, w, 12)), np.zeros((0, w))
     sets = np.zeros(2, dtype=np.int64), np.empty(n, dtype=np.int64)
     slack = 4.0 * BEYOND * contact.size
-    turns = *contact.motion.pivots, np.zeros(w)
+    turns = *contact.motion.pivots, torques
     shapes = called, contact.at_rest, boxes, contact.first
     return CalledWalls(*shapes, slack, *masses, *times, *turns, *sets, *np.empty((2, n, 3)), np.zeros(2))
 
@@ -144,8 +145,8 @@ def press_called(s, step):
     nodes, motion, walls, out, contacts, called = s.nodes, s.motion, s.walls, s.pressed, s.contacts, s.called_walls
     counts = called.counts
     counts[FOUND] = find_beyond(motion, walls, out, contacts)
-    if called.massive and s.calls.walls(step, MOVED) != 0:
-        s.course.unsolved = LOST
+    if called.massive and s.calls.python(step, MOVE) != 0:
+        s.course[UNSOLVED] = LOST
         return
     found, answer, m = counts[FOUND], AGAIN, 0
     while answer == AGAIN:
@@ -155,8 +156,8 @@ def press_called(s, step):
                 _show(i, s)
             for i in called.nodes[: counts[SUSPECTS]]:
                 _show(i, s)
-            answer = s.calls.walls(step, PRESSED)
-            s.course.unsolved = answer
+            answer = s.calls.python(step, PRESS)
+            s.course[UNSOLVED] = answer
             m = counts[FOUND] if answer == 0 else 0
             contacts.friction = called.losses[0]
     for j in range(m):
@@ -174,7 +175,7 @@ def close_on_called(s, step):
     contacts, touched, called, state = s.contacts, s.walls.touched, s.called_walls, s.state
     if len(contacts.met) == 0 and len(contacts.touched) == 0 and not called.massive:
         return
-    around, m, count = join_nodes(contacts.met, contacts.touched, s.walls.present), 0, 0
+    around, m = join_nodes(contacts.met, contacts.touched, s.walls.present), 0
     for i in around:
         changes = False
         for k in range(touched.closed.shape[1]):
@@ -188,15 +189,11 @@ def close_on_called(s, step):
     called.counts[SUSPECTS] = m
     if m > 0 or called.massive:
         put_rates(s.moving, step, s.held, state.v, state.a)
-        if s.calls.walls(step, STOPPED) != 0:
-            s.course.unsolved = LOST
+        if s.calls.python(step, STOP) != 0:
+            s.course[UNSOLVED] = LOST
             return
         contacts.impact += called.losses[1]
-    for i in around:
-        if touched.closed[i].any():
-            around[count] = i
-            count += 1
-    contacts.met = around[:count].copy()
+    contacts.met = closed_nodes(around, touched)
 
 
 @addressed
@@ -211,6 +208,6 @@ def work_of_turns(s, step):
             y = called.centres[k, other] + motions[step + 1, 0, k, other]
             moment = pressed.moment[k, c] - (x * pressed.force[k, other] - y * pressed.force[k, one])
             torque += called.axes[k, c] * moment
-        work += 0.5 * (called.torques[k] + torque) * (called.angles[step + 1, k] - called.angles[step, k])
-        called.torques[k] = torque
+        work += 0.5 * (called.torques[k, 0] + torque) * (called.angles[step + 1, k] - called.angles[step, k])
+        called.torques[k, 0] = torque
     s.ledger[PUSHED] += work

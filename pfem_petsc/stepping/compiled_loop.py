@@ -15,19 +15,33 @@ from ..mechanics.internal_forces import BarArrays, internal_forces
 from ..mechanics.layout import clear, join_components, split_components
 from ..mechanics.loads import LoadSchedule, set_forces
 from ..mesh.exchange import Messages
-from .called_walls import CalledWalls
+from .called_walls import CLOSE, SOLVE, TOUCH, CalledWalls
 from .contact_phase import PUSHED, ContactNodes, WallArrays
 from .impact import join_nodes
-from .impulses import SUPPORT, WALLS, ContactSums, record_forces
+from .impulses import SUPPORT, ContactSums, record_forces
 from .phases import (
+    CHANGED,
+    COLLAPSED,
     CONTACT,
     DAMPING,
+    DONE,
     EXTERNAL,
+    HOLDS,
     INERTIAL,
+    INFEASIBLE,
     INTERNAL,
     KINETIC,
     LOST,
+    MPI_ERROR,
+    NEAR,
+    NEEDS_ENERGIES,
+    PASSED,
+    PRESSING,
+    RECORDED,
+    SHORTENED,
     SUPPORTS,
+    TURNED,
+    UNSOLVED,
     GroundSprings,
     Motion,
     MovingSupports,
@@ -36,18 +50,13 @@ from .phases import (
     StepSums,
     accumulate,
     clear_vector,
-    correct_moving_ends,
     displace,
     move,
     numerical_dissipation,
     put_rates,
     rates_of,
-    restore_increments,
     work_of_contact,
 )
-
-SOLVE, CLOSE = range(2)
-"""What a call of Python does: solve rows, or find the energy that they lose."""
 
 HELD, CHANGING, CLOSED = range(3)  # places of numbers in CalledRows
 WAY_LEFT, WAY, DRIFT, MOST = 0, 1, 2, 5  # places in StepArrays.asleep
@@ -117,7 +126,8 @@ class StateArrays(NamedTuple):
 
 @record
 class ImpulseArrays(NamedTuple):
-    """Particles (rows, 3) of :mod:`~pfem_petsc.stepping.impulses`: the scheme's memory and their state."""
+    """Particles (rows, 3) of :mod:`~pfem_petsc.stepping.impulses`: the scheme's memory and their state. Their
+    accelerations are the forces, of which the sums of steps, walls and rows are parts."""
 
     half: np.ndarray
     a: np.ndarray
@@ -126,15 +136,13 @@ class ImpulseArrays(NamedTuple):
 
 @record
 class Calls(NamedTuple):
-    """Functions that the loop calls: of MPI, one of Python, of a step and :data:`SOLVE` or :data:`CLOSE`, one of a
-    step that adds the forces of bars that touch, and one for :class:`~pfem_petsc.stepping.called_walls.CalledWalls`."""
+    """Functions that the loop calls: of MPI, and one of Python, of a step and what to do, see
+    :class:`~pfem_petsc.stepping.callers.Caller`."""
 
     start_all: Any
     wait_all: Any
     reduce_all: Any
     python: Any
-    touch: Any
-    walls: Any
 
 
 @record
@@ -162,41 +170,18 @@ class Contacts(NamedTuple):
 
 
 @record
-class Course(NamedTuple):
-    """How a step goes on, which compiled steps assign: whether increments and energies are needed; what
-    :func:`~pfem_petsc.mechanics.internal_forces.internal_forces` returns; the number of shares of rows that are
-    written; whether a condition holds here, and after :func:`agree` on any rank; the error code of MPI; and what a call
-    of Python returned."""
-
-    keeps: bool
-    needs_energies: bool
-    failed: int
-    shortened: bool
-    changed: int
-    recorded: int
-    holds: bool
-    lost: int
-    unsolved: int
-
-
-def new_course() -> Course:
-    """Return that of steps of which none is made."""
-    return Course(False, False, failed=-1, shortened=False, changed=0, recorded=0, holds=False, lost=0, unsolved=0)
-
-
-@record
 class StepArrays(NamedTuple):
-    """All that compiled steps read and write, of which the latter parts are: the sums of the ledger, of which the
-    dissipations by impact and friction and the work of walls are added to; works (5,) of all balances; energies of
-    bars; particles of impulses, and their increments (rows, 3) in a step; the nodes of probes; forces of walls (w, 3)
-    at the start [N]; energy of bars that touch, what they have lost [J], and their columns of a row (5,); of bars that
-    are too far from each other to touch, by how much they may come closer until Python looks again, by how much they
-    have at most [m], and the drift and bounds of :func:`~pfem_petsc.contact.self_contact.largest_move` (8,); and this
-    rank's shares (m, width) of the rows of the steps that are due, and at last of the last step if it is not, see
-    :class:`~pfem_petsc.columns.Share`."""
+    """All that compiled steps read and write. ``course`` are the numbers of :mod:`~pfem_petsc.stepping.phases`. The
+    latter parts are: the sums of the ledger, of which the dissipations by impact and friction and the work of walls are
+    added to; works (5,) of all balances; energies of bars; particles of impulses; the nodes of probes; forces of walls
+    (w, 3) at the start [N]; energy of bars that touch, what they have lost [J], and their columns of a row (5,); of
+    bars that are too far from each other to touch, by how much they may come closer until Python looks again, by how
+    much they have at most [m], and the drift and bounds of :func:`~pfem_petsc.contact.self_contact.largest_move` (8,);
+    and this rank's shares (m, width) of the rows of the steps that are due, and at last of the last step if it is not,
+    see :class:`~pfem_petsc.columns.Share`."""
 
     contacts: Contacts
-    course: Course
+    course: np.ndarray
     nodes: Nodes
     motion: Motion
     held: Prescribed
@@ -209,7 +194,6 @@ class StepArrays(NamedTuple):
     called: CalledRows
     sums: StepSums
     pressed: ContactNodes
-    outcome: np.ndarray
     messages: Messages
     calls: Calls
     state: StateArrays
@@ -217,19 +201,11 @@ class StepArrays(NamedTuple):
     works: np.ndarray
     energies: np.ndarray
     impulses: ImpulseArrays
-    particles: np.ndarray
     probes: np.ndarray
     push: np.ndarray
     touching: np.ndarray
     asleep: np.ndarray
     shares: np.ndarray
-
-
-DONE, PASSED, RECORDED, LOST_BY_MPI, CHANGED, COLLAPSED, TURNED, UNSOLVED, NEAR, PRESSING = range(10)
-"""Numbers of the outcome of some steps: of steps made; of those that other ranks make too, of which this one only sends
-messages after a failure; of shares of rows; the error code of MPI. In the last step: the number of bars that changed
-their state of rupture; the first bar that collapsed, and that went through zero length, or -1; whether a call for rows
-failed; the number of nodes beyond walls or that rebound, in ContactNodes; and of nodes with contact forces."""
 
 
 _RUBBED, _IMPACT = map(HEAD.first, ("friction_dissipation", "impact_dissipation"))
@@ -273,7 +249,7 @@ def send_positions(s, step):
     lost = calls.start_all(np.int32(messages.count), messages.requests.ctypes)
     if lost == 0:
         lost = calls.wait_all(np.int32(messages.count), messages.requests.ctypes, messages.statuses.ctypes)
-    s.course.lost = lost
+    s.course[MPI_ERROR] = lost
 
 
 @addressed
@@ -290,9 +266,9 @@ def take_positions(s, step):
 def agree(s, step):
     """Find whether the condition holds on any rank. Collective."""
     mine, every, handles = np.zeros(1, dtype=np.int32), np.zeros(1, dtype=np.int32), s.messages.handles
-    mine[0] = 1 if s.course.holds else 0
-    s.course.lost = s.calls.reduce_all(mine.ctypes, every.ctypes, np.int32(1), handles[0], handles[1], handles[2])
-    s.course.holds = every[0] > 0
+    mine[0] = s.course[HOLDS]
+    s.course[MPI_ERROR] = s.calls.reduce_all(mine.ctypes, every.ctypes, np.int32(1), handles[0], handles[1], handles[2])
+    s.course[HOLDS] = every[0] > 0
 
 
 @addressed
@@ -306,11 +282,11 @@ def evaluate_forces(s, step):
     """Compute internal forces, and the energies if they are needed."""
     bars, motion, course = s.bars, s.motion, s.course
     clear(motion.f)
-    if course.needs_energies:
+    if course[NEEDS_ENERGIES] > 0:
         clear_vector(s.energies)
-    laws = bars.full if course.needs_energies else bars.brief
-    energies = s.energies[: len(s.energies) if course.needs_energies else 0]
-    course.failed, course.shortened, course.changed = internal_forces(
+    laws = bars.full if course[NEEDS_ENERGIES] > 0 else bars.brief
+    energies = s.energies[: len(s.energies) if course[NEEDS_ENERGIES] > 0 else 0]
+    course[COLLAPSED], course[SHORTENED], course[CHANGED] = internal_forces(
         motion.x, motion.f, bars.arrays, laws, motion.h, np.bool_(True), energies
     )
 
@@ -324,8 +300,8 @@ def touch_bars(s, step):
         if asleep[WAY] + way < asleep[WAY_LEFT]:
             asleep[WAY] += way
             return
-    if s.calls.touch(step, np.int64(0)) != 0:
-        s.course.unsolved = LOST
+    if s.calls.python(step, TOUCH) != 0:
+        s.course[UNSOLVED] = LOST
 
 
 @inlined
@@ -352,7 +328,7 @@ def solve_called(s, step):
         for c in range(3):
             s.state.x[i, c], called.u[i, c] = x[c, i], u[c, i]
             called.predictor[i, c] = x[c, i] + (h * half[c, i] - u[c, i])
-    s.course.unsolved = s.calls.python(step, SOLVE)
+    s.course[UNSOLVED] = s.calls.python(step, SOLVE)
     for i in called.nodes:
         for c in range(3):
             if called.u[i, c] != u[c, i]:
@@ -378,7 +354,7 @@ def close_called(s, step):
             rates_of(i, s.motion, s.state.v, s.state.a)
         put_rates(s.moving, step, s.held, s.state.v, s.state.a)
         if s.calls.python(step, CLOSE) != 0:  # the rows have been solved, so this is an error
-            s.course.unsolved = LOST
+            s.course[UNSOLVED] = LOST
         s.contacts.impact += called.loss[0]
         called.counts[CHANGING] = 0
 
@@ -393,29 +369,15 @@ def book_springs(s, step):
 @addressed
 def push_particles(s, step):
     """Advance the particles of the impulses by a step, with the forces of the balance, of walls and of rows."""
-    forces, walls, links, u, h = s.sums.forces, s.pressed.force, s.called.totals, s.particles, s.motion.h
-    first, torques = WALLS + len(walls), s.called_walls.torques
-    turns = first + len(walls) + 2 * len(links)
-    for k in range(len(u)):
+    for k in range(len(s.impulses.half)):
         for c in range(3):
-            if k < WALLS:
-                load = forces[k, c]
-            elif k < first:
-                load = walls[k - WALLS, c]
-            elif k < first + len(links):
-                load = links[k - first, c]
-            elif turns <= k < turns + len(walls) and c == 0:
-                load = torques[k - turns]
-            else:  # jumps, which need Python
-                load = 0.0
-            u[k, c] = h * h * load
-            s.impulses.half[k, c] += h * load
+            s.impulses.half[k, c] += s.motion.h * s.impulses.a[k, c]
 
 
 @inlined
 def _probed(s):
     """Return this rank's share of the row that is due, and its values of probes (p, 4, 3)."""
-    row = s.shares[s.course.recorded]
+    row = s.shares[s.course[RECORDED]]
     return row, row[len(row) - 3 * _PROBED * len(s.probes) :].reshape(len(s.probes), _PROBED, 3)
 
 
@@ -423,28 +385,19 @@ def _probed(s):
 def sum_ends(s, step):
     """Find sums at the end of a step, and write motion and forces of supports and contact at the probes."""
     accumulate(s.nodes, s.motion, s.contacts.pressing, s.sums)
-    h, motion = s.motion.h, s.motion
-    _, values = _probed(s)
+    motion, v, a, (_, values) = s.motion, s.state.v, s.state.a, _probed(s)
+    for i in s.probes:
+        rates_of(i, motion, v, a)
+    put_rates(s.moving, step, s.held, v, a)
     for k in range(len(s.probes)):
         i = s.probes[k]
         for c in range(3):
-            values[k, 0, c] = motion.x[c, i]
-            values[k, 1, c] = motion.half[c, i] - 0.5 / h * motion.u[c, i]
-            values[k, 2, c] = motion.u[c, i] / (h * h)
+            values[k, 0, c], values[k, 1, c], values[k, 2, c] = motion.x[c, i], v[i, c], a[i, c]
             values[k, 3, c] = s.held.reaction[i, c] + motion.contact[i, c]
-    impulses, particles = s.impulses, s.particles
-    for k in range(len(particles)):
+    impulses = s.impulses
+    for k in range(len(impulses.v)):
         for c in range(3):
-            impulses.v[k, c] = impulses.half[k, c] - 0.5 / h * particles[k, c]
-            impulses.a[k, c] = particles[k, c] / (h * h)
-
-
-@addressed
-def sum_moving(s, step):
-    """Correct the sums at the end of a step for supports that move."""
-    correct_moving_ends(s.moving, step, s.held, s.nodes, s.motion, s.sums, _probed(s)[1])
-    for c in range(3):
-        s.impulses.v[SUPPORT, c] += s.sums.jumps[1, c]
+            impulses.v[k, c] = impulses.half[k, c] - 0.5 * motion.h * impulses.a[k, c]
 
 
 @addressed
@@ -481,8 +434,6 @@ def record_row(s, step):
 def put_state(s, step):
     """Write the state at the end of a step: velocities and accelerations by the scheme alone, or of supports."""
     state, motion, h = s.state, s.motion, s.motion.h
-    if not s.course.keeps:
-        restore_increments(s.nodes, motion, s.held)
     join_components(motion.x, state.x)
     join_components(motion.f, state.f)
     join_components(motion.half, state.half)
@@ -502,23 +453,22 @@ def run_compiled(s, phases, starts, due, flags):
     (count,) bool, the steps with a row; and ``flags`` (count, walls) bool, which receives the walls that are touched in
     each step. The state is that after the last step. Fewer steps are made where bars of any rank change their state of
     rupture, and where something fails, except on several ranks that need not agree: these make all steps then, as
-    others wait for their messages. It returns the first four of Contacts, and writes the outcome.
+    others wait for their messages. It returns the first four of Contacts.
     """
     contacts, course, motion, sums, pressed = s.contacts, s.course, s.motion, s.sums, s.pressed
     count, several, linked = len(due), s.messages.several, s.called.any
     calling = (linked and not s.called.watched) or s.called_walls.massive  # which ranks do together
     agrees = several and (s.bars.can_break or calling)  # ranks that make the same steps
-    keeps = flags.shape[1] > 0 or linked or calling or len(s.nodes.damping) > 0 or s.nodes.external.shape[1] > 0
-    pressed.failure[0] = -1
-    turned, done, passed, stops = np.int64(-1), 0, 0, False
+    course[COLLAPSED] = course[TURNED] = course[INFEASIBLE] = -1
     split_components(s.state.x, motion.x)
     split_components(s.state.half, motion.half)
     for step in range(count):
-        if course.failed >= 0 or turned >= 0 or pressed.failure[0] >= 0 or (course.unsolved != 0 and not calling):
+        failed = course[COLLAPSED] >= 0 or course[TURNED] >= 0 or course[INFEASIBLE] >= 0
+        if failed or (course[UNSOLVED] != 0 and not calling):
             # the other ranks still need messages, until all know of the failure
             _perform(SEND, phases, starts, s, step)
-            passed += 1
-            if course.lost != 0:
+            course[PASSED] += 1
+            if course[MPI_ERROR] != 0:
                 break
             continue
         last_one = step == count - 1
@@ -531,59 +481,49 @@ def run_compiled(s, phases, starts, due, flags):
         contacts.friction = contacts.impact = 0.0
         move(motion.x, motion.h, motion.half)
         _perform(SEND, phases, starts, s, step)
-        if course.lost != 0:
+        if course[MPI_ERROR] != 0:
             break
         _perform(TAKE, phases, starts, s, step)
-        course.keeps = keeps or ending
-        course.needs_energies = ending or s.bars.can_break  # a bar that breaks ends the steps
+        course[NEEDS_ENERGIES] = ending or s.bars.can_break  # a bar that breaks ends the steps
         _perform(FORCES, phases, starts, s, step)
-        if course.unsolved == LOST:
-            break
         _perform(PRESS, phases, starts, s, step)
-        if course.unsolved == LOST:
-            break
         _perform(IMPACTS, phases, starts, s, step)
-        if course.unsolved == LOST:
+        if course[UNSOLVED] == LOST:
             break
         s.ledger[_IMPACT] += contacts.impact
         _perform(BOOK, phases, starts, s, step)
         for k in range(flags.shape[1]):
             flags[step, k] = pressed.contacts[k] > 0
-        done += 1
-        passed += 1
-        stops = course.changed > 0
-        wrong = stops or course.failed >= 0 or pressed.failure[0] >= 0 or course.unsolved != 0
+        course[DONE] += 1
+        course[PASSED] += 1
+        stops = course[CHANGED] > 0
+        wrong = stops or course[COLLAPSED] >= 0 or course[INFEASIBLE] >= 0 or course[UNSOLVED] != 0
         wrong = wrong or not np.isfinite(sums.works[INTERNAL])
-        looks = course.holds = wrong or course.shortened
+        course[HOLDS] = wrong or course[SHORTENED] > 0
         if agrees:  # whether any rank has to look at its state
             _perform(AGREE, phases, starts, s, step)
-            looks = course.holds
-            if course.lost != 0:
-                break
+        looks = course[HOLDS] > 0
         if looks or last_one:
             _perform(END, phases, starts, s, step)
-            if course.failed < 0 and course.shortened:
-                turned = np.int64(first_inverted(s.state.x, s.state.before, s.bars.ends, s.bars.watched))
-            wrong = wrong or turned >= 0
-        if agrees and looks:  # whether any rank found something wrong
-            course.holds = wrong
+            if course[COLLAPSED] < 0 and course[SHORTENED] > 0:
+                course[TURNED] = first_inverted(s.state.x, s.state.before, s.bars.ends, s.bars.watched)
+            wrong = wrong or course[TURNED] >= 0
+        if agrees and looks and course[MPI_ERROR] == 0:  # whether any rank found something wrong
+            course[HOLDS] = wrong
             _perform(AGREE, phases, starts, s, step)
-            stops = course.holds
-            if course.lost != 0:
-                break
+            stops = course[HOLDS] > 0
             wrong = wrong or stops
+        if course[MPI_ERROR] != 0:
+            break
         if ending or wrong:
             _perform(RECORD, phases, starts, s, step)
             contacts.changes = 0 if due[step] else contacts.changes
-            course.recorded += 1
+            course[RECORDED] += 1
         for c in range(3):
             s.impulses.half[SUPPORT, c] += sums.jumps[0, c]
         for k in range(len(s.works)):
             s.works[k] += sums.works[k]
         if stops or (wrong and not several):
             break
-    found = done, passed, course.recorded, course.lost, course.changed, course.failed, turned, course.unsolved
-    for k in range(len(found)):
-        s.outcome[k] = found[k]
-    s.outcome[NEAR], s.outcome[PRESSING] = len(contacts.near), len(contacts.pressing)
+    course[NEAR], course[PRESSING] = len(contacts.near), len(contacts.pressing)
     return contacts.touched, contacts.met, contacts.changes, contacts.friction

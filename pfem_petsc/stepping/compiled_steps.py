@@ -23,29 +23,19 @@ from ..mesh.exchange import SIGNATURES, CFunction, mpi_functions
 from ..mesh.ordering import NODE_BLOCK
 from ..parallel.heap import return_freed_memory
 from .called_walls import close_on_called, press_called, work_of_turns
-from .callers import RowCaller, TouchCaller, WallCaller
+from .callers import Caller, RowCaller, TouchCaller, WallCaller
 from .compiled_loop import (
     AGREE,
     BEGIN,
     BOOK,
-    CHANGED,
-    COLLAPSED,
-    DONE,
     END,
     FORCES,
     HELD,
     IMPACTS,
-    LOST_BY_MPI,
-    NEAR,
-    PASSED,
     PRESS,
-    PRESSING,
     RECORD,
-    RECORDED,
     SEND,
     TAKE,
-    TURNED,
-    UNSOLVED,
     Calls,
     Contacts,
     ImpulseArrays,
@@ -57,7 +47,6 @@ from .compiled_loop import (
     close_called,
     evaluate_forces,
     join_pressing,
-    new_course,
     push_particles,
     put_state,
     record_row,
@@ -66,7 +55,6 @@ from .compiled_loop import (
     set_loads,
     solve_called,
     sum_ends,
-    sum_moving,
     take_positions,
     touch_bars,
 )
@@ -78,19 +66,31 @@ from .contact_phase import (
     press_walls,
     work_of_walls,
 )
-from .impact import Touched
+from .impulses import WALLS
 from .phases import (
+    CHANGED,
+    COLLAPSED,
+    DONE,
+    INFEASIBLE,
+    MPI_ERROR,
+    NEAR,
+    PASSED,
+    PRESSING,
+    RECORDED,
+    TURNED,
+    UNSOLVED,
+    WHY,
     GroundSprings,
     Motion,
     MovingSupports,
     Nodes,
     Prescribed,
-    accumulate_drags,
     accumulate_loads,
     add_springs,
     apply_supports,
     balancing,
     correct_moving,
+    correct_moving_ends,
     new_sums,
     place_supports,
     react,
@@ -124,18 +124,23 @@ class CompiledSteps:
         places, forces = model.bars.components
         self._motion = Motion(stepper.h, places, np.empty((3, n)), np.zeros((3, n)), forces, self._contact)
         self._nodes, self._held, self._walls = self._make_nodes(), self._make_held(), self._make_walls()
-        self._springs, self._sums, self._at_rest = self._make_springs(), new_sums(), self._moving_supports(0, 0)
-        rooms = n, len(model.contact.walls), len(model.contact.wall_of)
-        self._pressed, self._outcome = new_contact_nodes(*rooms), np.zeros(10, dtype=np.int64)
-        self._called = RowCaller(stepper, self._nodes.stiffness, self._u, self._contact)
-        self._toucher, self._wall_caller = (
-            TouchCaller(stepper, self._motion.half),
-            WallCaller(stepper, self._nodes, self._pressed, self._contact),
-        )
-        calls = *_mpi(), self._called.function, self._toucher.function, self._wall_caller.function
-        self._messages, self._calls = model.mesh.messages(), Calls(*calls)
+        self._at_rest, ground = self._moving_supports(0, 0), model.bars.springs
+        self._springs = GroundSprings(np.empty(0, dtype=np.int64), np.empty((0, 3, 3)), np.empty((0, 3)))
+        if ground is not None:
+            self._springs = GroundSprings(ground.nodes, ground.stiffness, ground.anchors)
+        # the forces on the particles of the impulses are the sums of steps, walls and rows
+        impulses = self.ledger.impulses
+        self._loads, rows = np.zeros_like(impulses.state.v), WALLS + impulses.n_walls
+        self._sums = new_sums()._replace(forces=self._loads[:WALLS])
+        self._pressed = new_contact_nodes(n, len(model.contact.wall_of), self._loads[WALLS:rows])
+        totals, torques = self._loads[rows : impulses.jumps], self._loads[impulses.turns :][: impulses.n_walls]
+        self._rows = RowCaller(stepper, self._nodes.stiffness, self._u, self._contact, totals)
+        self._touch = TouchCaller(stepper, self._motion.half)
+        self._wall_caller = WallCaller(stepper, self._nodes, self._pressed, self._contact, torques)
+        self._caller = Caller(self._rows, self._touch, self._wall_caller)
+        self._messages, self._calls = model.mesh.messages(), Calls(*_mpi(), self._caller.function)
         self._references, self._phases = References(), None
-        self._energies, self._particles = np.zeros(len(BAR_ENERGIES)), np.empty(self.ledger.impulses.state.v.shape)
+        self._energies, self._course = np.zeros(len(BAR_ENERGIES)), np.zeros(PRESSING + 1, dtype=np.int64)
         bars, nodes = model.probed_bars.width, stepper.probed
         share = Share(len(model.contact.names), len(model.links.columns), bars, len(nodes))
         self._width, self._at_state = len(share.numbers), at_state(model)
@@ -161,43 +166,26 @@ class CompiledSteps:
 
     def _make_walls(self) -> WallArrays:
         contact, log, n = self.model.contact, self.model.contact.log, len(self._u)
-        touched = Touched(
-            log.touching, self.stepper.closed, contact.fixed, contact.restitution, self.ledger.impacts.slack
-        )
         called = contact.called[contact.wall_of]
         surfaces = contact.surfaces._replace(radii=np.where(called, OTHER, contact.surfaces.radii))
-        at_end, level = surfaces.copy(), surfaces.copy()
         acting = self.stepper.scheme.balance(self.stepper.state, self.stepper.h).acting
-        way = np.zeros(level.centres.shape)
-        walls = contact.pressed_walls(at_end, acting, way)
+        level = surfaces.copy()
+        walls = contact.pressed_walls(surfaces.copy(), acting, np.zeros_like(level.centres))
         room = np.empty((3, n if len(contact.walls) else 0)), np.zeros(n // NODE_BLOCK + 1, dtype=bool)
-        motions = self._wall_motions(0, 0)
+        motions, touched = self._wall_motions(0, 0), self.ledger.impacts.touched
         return WallArrays(walls, surfaces, level, motions, touched, log.present, log.releases, *room)
-
-    def _bars(self) -> StepBars:
-        bars = self.model.bars
-        return StepBars(
-            bars.reference, bars.loops("brief"), bars.loops("full"), bars.ends, bars.watched, bars.can_break
-        )
-
-    def _make_springs(self) -> GroundSprings:
-        springs = self.model.bars.springs
-        if springs is None:
-            return GroundSprings(np.empty(0, dtype=np.int64), np.empty((0, 3, 3)), np.empty((0, 3)))
-        return GroundSprings(springs.nodes, springs.stiffness, springs.anchors)
 
     def _moving_supports(self, begin: int, count: int) -> MovingSupports:
         """Return the supports that move in ``count`` steps from one of a number on."""
-        supports = self.model.supports
-        motions, columns = supports.schedule(self._times(begin, count if supports.moves else -2), self.stepper.h)
-        at = np.flatnonzero(columns >= 0)
-        moved, probes = np.nonzero(self._held.nodes[at][:, None] == self.stepper.probed)
-        return MovingSupports(at, columns[at], supports.origins[at], motions, np.column_stack([moved, probes]))
+        supports, at = self.model.supports, np.flatnonzero(self.model.supports.columns >= 0)
+        motions = supports.schedule(self._times(begin, count if supports.moves else -2), self.stepper.h)
+        return MovingSupports(at, supports.columns[at], supports.origins[at], motions)
 
     def _contacts(self) -> Contacts:
         """Return the contacts before the first step."""
-        log, met, friction = self.model.contact.log, self.ledger.impacts.met, float(self.ledger.friction_ahead)
-        called = self._called.record
+        log, friction = self.model.contact.log, float(self.ledger.friction_ahead)
+        met = np.flatnonzero(log.closed.any(axis=1))
+        called = self._rows.record
         others = called.held[: called.counts[HELD]].copy()
         nodes = log.last, others, np.concatenate([log.last, others])
         return Contacts(log.last, met, log.changes, friction, *nodes, 0.0)
@@ -206,7 +194,7 @@ class CompiledSteps:
         """Return the phases of a step that this case needs, and where those of each time begin."""
         model = self.model
         damped, loaded, held = model.inertia.damped, model.external.active, len(self._held.nodes) > 0
-        called, walls = self._called.record.any, len(model.contact.walls) > 0
+        called, walls = self._rows.record.any, len(model.contact.walls) > 0
         several, springs, moves = model.comm.size > 1, len(self._springs.nodes) > 0, model.supports.moves
         touch, walls_move = walls or called, model.contact.moving.any()
         pressed, close = self._walls.pressed, close_on_walls
@@ -246,9 +234,8 @@ class CompiledSteps:
             END: ((put_state, True),),
             RECORD: (
                 (sum_ends, True),
-                (accumulate_loads, loaded),
-                (accumulate_drags, damped),
-                (sum_moving, moves),
+                (accumulate_loads, loaded or damped),
+                (correct_moving_ends, moves),
                 (record_row, True),
             ),
         }
@@ -298,30 +285,32 @@ class CompiledSteps:
         shares = np.zeros((len(steps) + (0 if due[-1] else 1), self._width))
         begin, impulses = state.step, ledger.impulses.state
         flags = np.zeros((count, len(log.releases)), dtype=bool)
-        self._called.begin(begin)
-        self._toucher.begin(begin)
-        self._wall_caller.begin(begin)
+        self._caller.begin(begin)
+        self._touch.sleep()
         contacts = self._contacts()
         ledger.sums[_BROKEN] = stepper.ruptures.count
         half, walls = state.memory["half_velocity"], self._walls
         if model.contact.moving.any():
             walls = walls._replace(motions=self._wall_motions(begin, count))
+        self._course[:] = 0
+        impulses.a = self._loads
+        bars = model.bars
+        laws = bars.loops("brief"), bars.loops("full")
         arrays = StepArrays(
             by_reference(contacts),
-            by_reference(new_course()),
+            self._course,
             self._nodes,
             self._motion,
             self._held,
             self._moving_supports(begin, count) if model.supports.moves else self._at_rest,
             self._springs,
-            self._bars(),
+            StepBars(bars.reference, *laws, bars.ends, bars.watched, bars.can_break),
             model.external.schedule(range(begin + 1, begin + 1 + count), stepper.h),
             walls,
             self._wall_caller.schedule(self._times(begin, count)),
-            self._called.record,
+            self._rows.record,
             self._sums,
             self._pressed,
-            self._outcome,
             self._messages,
             self._calls,
             StateArrays(state.x, stepper.before, state.f, half, self._u, state.v, state.a),
@@ -329,23 +318,21 @@ class CompiledSteps:
             ledger.powers,
             self._energies,
             ImpulseArrays(impulses.memory["half_velocity"], impulses.a, impulses.v),
-            self._particles,
             stepper.probed,
             stepper.solution.walls.force.copy(),
-            self._toucher.sums,
-            self._toucher.asleep,
+            self._touch.sums,
+            self._touch.asleep,
             shares,
         )
         reference = self._references.of(arrays)
         if self._phases is None:
             self._phases = self._make_phases(types.void(numba.typeof(reference), types.int64))
         contacts = Contacts(*run_compiled(reference, *self._phases, due, flags), *contacts[4:])
-        self._toucher.end()
-        self._wall_caller.end()
-        self._called.end()
-        made = self._outcome.tolist()
-        if made[LOST_BY_MPI]:
-            raise MPI.Exception(made[LOST_BY_MPI])
+        self._touch.wake(bars.components[0].T[: len(state.x)])
+        self._caller.end()
+        made = self._course.tolist()
+        if made[MPI_ERROR]:
+            raise MPI.Exception(made[MPI_ERROR])
         end, row = made[PASSED], shares[made[RECORDED] - 1]
         sound = self._take(made, contacts, row[_BARS])
         fill_at_state(self._at_state, stepper, row)
@@ -366,7 +353,7 @@ class CompiledSteps:
     def _take(self, made: list[int], contacts: Contacts, energies: np.ndarray) -> int:
         """Take the state after the last step, with ``energies`` of the bars [J]; return how many steps are sound."""
         stepper, state, model = self.stepper, self.stepper.state, self.model
-        model.contact.log.last, self.ledger.impacts.met = contacts.touched, contacts.met
+        model.contact.log.last = contacts.touched
         state.support = self._reaction if model.supports.any else stepper.zero
         state.contact = self._contact if made[PRESSING] else stepper.zero
         if not model.external.steady:
@@ -406,18 +393,11 @@ class CompiledSteps:
         stepper, pressed = self.stepper, self._pressed
         if made[COLLAPSED] >= 0 or made[TURNED] >= 0:
             return SimulationFailure(stepper.collapse(max(made[COLLAPSED], made[TURNED])))
-        infeasible, why = pressed.failure.tolist()
-        if infeasible >= 0:
-            node, place = pressed.nodes[infeasible], pressed.places[infeasible]
-            time = stepper.scheme.balance(stepper.state, stepper.h).time
-            return self._at_balance(self.model.contact.placeless(node, why, place, time))
-        failure = self._called.failure or self._wall_caller.failure
-        return self._at_balance(failure) if made[UNSOLVED] else None
-
-    def _at_balance(self, text: object) -> SimulationFailure:
-        """Return a failure of the balance for the next positions."""
-        stepper = self.stepper
-        return SimulationFailure(f"{stepper.when(stepper.scheme.balance(stepper.state, stepper.h))}: {text}")
+        balance, at = stepper.scheme.balance(stepper.state, stepper.h), made[INFEASIBLE]
+        text: object = self._caller.failure if made[UNSOLVED] else None
+        if at >= 0:
+            text = self.model.contact.placeless(pressed.nodes[at], made[WHY], pressed.places[at], balance.time)
+        return None if text is None else SimulationFailure(f"{stepper.when(balance)}: {text}")
 
 
 def _mpi() -> tuple[CFunction, ...]:

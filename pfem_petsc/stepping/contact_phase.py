@@ -14,8 +14,8 @@ from ..contact.node_walls import compare_contacts
 from ..contact.surfaces import Surfaces, wall_gaps
 from ..mechanics.compiled import addressed, inlined, record
 from ..mesh.ordering import NODE_BLOCK
-from .impact import Approach, Touched, join_nodes, stop_nodes, unpressed
-from .phases import clear_rows, displace, put_rates, rates_of
+from .impact import Touched, closed_nodes, join_nodes, stop_nodes
+from .phases import INFEASIBLE, WHY, clear_rows, displace, put_rates, rates_of
 
 PUSHED = HEAD.first("contact_work")
 
@@ -42,28 +42,25 @@ class WallArrays(NamedTuple):
 
 @record
 class ContactNodes(NamedTuple):
-    """Results of :func:`~pfem_petsc.contact.explicit.press_nodes` in a step: room for ``nodes`` (n,), the slots
-    of walls that they are ``touching`` (n, s), their ``places`` (n, 3); ``failure`` (2,): the first of them without a
-    place, or -1, and why; and the sums of each wall, ``force``
-    (w, 3), ``contacts`` (w,) and ``moment`` (w, 3)."""
+    """Results of :func:`~pfem_petsc.contact.explicit.press_nodes` in a step: room for ``nodes`` (n,), the slots of
+    walls that they are ``touching`` (n, s), their ``places`` (n, 3); and the sums of each wall, ``force`` (w, 3),
+    ``contacts`` (w,) and ``moment`` (w, 3)."""
 
     nodes: np.ndarray
     touching: np.ndarray
     places: np.ndarray
-    failure: np.ndarray
     force: np.ndarray
     contacts: np.ndarray
     moment: np.ndarray
 
 
-def new_contact_nodes(n: int, w: int, s: int) -> ContactNodes:
-    """Return room for ``n`` nodes and ``w`` walls with ``s`` slots. Pages of memory that no node needs are not
-    touched."""
-    nodes = np.empty(n if w > 0 else 0, dtype=np.int64)
-    touching, places = np.empty((len(nodes), s), dtype=bool), np.empty((len(nodes), 3))
-    force, contacts, moment = np.zeros((w, 3)), np.zeros(w, dtype=np.int64), np.zeros((w, 3))
-    failure = np.full(2, -1, dtype=np.int64)
-    return ContactNodes(nodes, touching, places, failure, force, contacts, moment)
+def new_contact_nodes(n: int, s: int, force: np.ndarray) -> ContactNodes:
+    """Return room for ``n`` nodes and walls with ``s`` slots, whose ``force`` (w, 3) has its own. Pages of memory that
+    no node needs are not touched."""
+    n = n if len(force) else 0
+    touching, places = np.empty((n, s), dtype=bool), np.empty((n, 3))
+    contacts, moment = np.zeros(len(force), dtype=np.int64), np.zeros_like(force)
+    return ContactNodes(np.empty(n, dtype=np.int64), touching, places, force, contacts, moment)
 
 
 @addressed
@@ -199,7 +196,7 @@ def press_walls(curved: Any, rough: Any, several: Any) -> Any:
                 for k in range(touching.shape[1]):
                     out.touching[j, k] = touching[j, k]
             if failed >= 0:
-                out.failure[0], out.failure[1] = failed, why
+                s.course[INFEASIBLE], s.course[WHY] = failed, why
         note_contacts(m, walls, out, contacts)
 
     return press
@@ -213,23 +210,20 @@ def close_on_walls(s, step):
         return
     around = join_nodes(contacts.met, contacts.touched, walls.present)
     normals, gaps = wall_gaps(around, s.motion.x.T, walls.level)
-    rates = np.zeros(normals.shape)
-    for j in range(len(rates) if len(walls.motions) > 0 else 0):
-        for k in range(rates.shape[1]):
-            for c in range(3):
-                rates[j, k, c] = walls.motions[step + 1, 1, k, c]
-    v, a, nodes, motion = s.state.v, s.state.a, s.nodes, s.motion
+    speeds, towards, moves = np.zeros(gaps.shape), np.zeros(gaps.shape), len(walls.motions) > 0
+    v, a, motion = s.state.v, s.state.a, s.motion
     for i in around:
         rates_of(i, motion, v, a)
-    free_v, free_a = unpressed(around, v, a, motion.contact, nodes, 1.0 / (motion.h * motion.h), 0.5 / motion.h)
     put_rates(s.moving, step, s.held, v, a)
     for j in range(len(around)):
         i = around[j]
         for c in range(3):
-            if walls.touched.fixed[i, c]:  # wall forces do not change prescribed components
-                free_v[j, c], free_a[j, c] = v[i, c], a[i, c]
-    still = np.zeros((gaps.shape[1], 3))
-    approach = Approach(normals, gaps, free_v, free_a, rates, still)
-    counted = np.ones(len(still), dtype=np.bool_)
-    loss, contacts.met = stop_nodes(around, approach, walls.touched, nodes.mass, counted, np.empty(gaps.shape))
-    contacts.impact += loss
+            # wall forces do not change prescribed components
+            u = 0.0 if walls.touched.fixed[i, c] else motion.contact[i, c] / s.nodes.stiffness[i]
+            free_v, free_a = v[i, c] - 0.5 / motion.h * u, a[i, c] - u / (motion.h * motion.h)
+            for k in range(gaps.shape[1]):
+                rate = walls.motions[step + 1, 1, k, c] if moves else 0.0
+                speeds[j, k] += normals[j, k, c] * (free_v - rate)
+                towards[j, k] -= normals[j, k, c] * free_a
+    contacts.impact += stop_nodes(around, normals, gaps, speeds, towards, walls.touched, s.nodes.mass)
+    contacts.met = closed_nodes(around, walls.touched)

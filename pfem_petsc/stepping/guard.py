@@ -66,11 +66,9 @@ _ITERATIONS = 200  # of conjugate gradients for each of them
 _SOLVED = 1e-8  # reduction of the residual, squared
 
 
-def _along(bars: np.ndarray, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return directions (b, 3) and lengths (b,) [m] of bars at positions (local, 3)."""
-    vectors = x[bars[:, 1]] - x[bars[:, 0]]
-    lengths = np.linalg.norm(vectors, axis=1)
-    return vectors / np.maximum(lengths, 1e-300)[:, None], lengths
+def _vectors(bars: np.ndarray, x: np.ndarray) -> np.ndarray:
+    """Return the vectors (b, 3) from first to second ends of bars at positions (local, 3) [m]."""
+    return x[bars[:, 1]] - x[bars[:, 0]]
 
 
 @kernel
@@ -78,40 +76,30 @@ def _largest_miss(bars, rest, before, after, predicted):
     """Largest change of a bar's vector that is not predicted, over its rest length, and the number of that bar."""
     worst, at = -1.0, 0
     for k in range(len(bars)):
-        if rest[k] == 0.0:  # it has left the model
-            continue
         a, b = bars[k, 0], bars[k, 1]
         changed = missed = 0.0
         for c in range(3):
             end = after[b, c] - after[a, c]
-            change = end - (before[b, c] - before[a, c])
-            miss = end - (predicted[b, c] - predicted[a, c])
-            changed += change * change
-            missed += miss * miss
-        value = np.sqrt(min(changed, missed)) / rest[k]
-        # what is not a number is the worst of all
-        if value > worst or value != value:
+            changed += (end - (before[b, c] - before[a, c])) ** 2
+            missed += (end - (predicted[b, c] - predicted[a, c])) ** 2
+        value = np.sqrt(min(changed, missed)) / rest[k] if rest[k] > 0.0 else 0.0  # a bar that has left the model
+        if not value <= worst:
             worst, at = value, k
-            if value != value:
+            if value != value:  # what is not a number is the worst of all
                 break
     return worst, at
 
 
 @kernel
-def _pull(bars, axes, lacking, w, out):
-    """Add to ``out`` the forces on nodes (n, 3) by bars that lack lengths (b,) and turn by displacements w (n, 3).
-
-    ``axes`` (b, 3): directions times the root of the stiffness.
-    """
+def _pull(bars, axes, stiffness, lacking, w, out):
+    """Add to ``out`` the forces on nodes (n, 3) by bars of some ``stiffness`` (b,) with directions ``axes`` (b, 3) that
+    lack lengths (b,) and turn by displacements w (n, 3)."""
     for k in range(len(bars)):
-        a, b = bars[k, 0], bars[k, 1]
-        along = stiffness = 0.0
+        a, b, along = bars[k, 0], bars[k, 1], -lacking[k]
         for c in range(3):
             along += axes[k, c] * (w[b, c] - w[a, c])
-            stiffness += axes[k, c] * axes[k, c]
-        along -= np.sqrt(stiffness) * lacking[k]
         for c in range(3):
-            force = along * axes[k, c] + SIDEWAYS * stiffness * (w[b, c] - w[a, c])
+            force = stiffness[k] * (along * axes[k, c] + SIDEWAYS * (w[b, c] - w[a, c]))
             out[a, c] += force
             out[b, c] -= force
 
@@ -168,11 +156,10 @@ class StepGuard:
         if 2.0 * largest_distance(after, self._predicted) <= NOTICEABLE * watched.min():  # the ends of any bar
             return 0.0, -1, (-1, -1), 0.0, 0.0
         value, k = _largest_miss(mesh.bars, watched, before, after, self._predicted)
-        a, b = mesh.bars[k]
-        start, end = before[b] - before[a], after[b] - after[a]
+        start, end = (_vectors(mesh.bars[k : k + 1], x)[0] for x in (before, after))
         lengths = np.linalg.norm(start) * np.linalg.norm(end)
         turn = np.degrees(np.arccos(np.clip(start @ end / max(lengths, 1e-300), -1.0, 1.0)))
-        nodes = int(mesh.node_ids[a]), int(mesh.node_ids[b])
+        nodes = int(mesh.node_ids[mesh.bars[k, 0]]), int(mesh.node_ids[mesh.bars[k, 1]])
         change = float(np.linalg.norm(end - start) / rest[k])
         return float(value), int(mesh.bar_ids[k]), nodes, change, float(turn)
 
@@ -215,9 +202,10 @@ class StepGuard:
         """
         model, middle, bars = self.model, self._middle, self.model.mesh.bars
         owned = model.mesh.n_owned
-        axes, lengths = _along(bars, middle)
-        lacking = 0.5 * (_along(bars, before)[1] + _along(bars, after)[1]) - lengths
-        axes *= np.sqrt(model.bars.stiffness)[:, None]
+        axes = _vectors(bars, middle)
+        lengths, *ends = (np.linalg.norm(_vectors(bars, x), axis=1) for x in (middle, before, after))
+        lacking = 0.5 * (ends[0] + ends[1]) - lengths
+        axes /= np.maximum(lengths, 1e-300)[:, None]
         push = model.contact.state.contact
         held = np.linalg.norm(push, axis=1, keepdims=True)
         push = push / np.where(held > 0.0, held, 1.0)
@@ -228,7 +216,7 @@ class StepGuard:
             shift[:owned] = w
             model.mesh.update_ghosts(shift)
             out = np.zeros_like(middle)
-            _pull(bars, axes, lacking, shift, out)
+            _pull(bars, axes, model.bars.stiffness, lacking, shift, out)
             free = out[:owned]
             free -= push * (free * push).sum(axis=1, keepdims=True)
             model.supports.clear(free)

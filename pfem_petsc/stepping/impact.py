@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from mpi4py import MPI
 
-from ..contact.surfaces import wall_gaps
 from ..mechanics.compiled import kernel, record
 from ..tolerances import ON_BOUND
 
@@ -34,47 +33,6 @@ def join_nodes(met, touched, present):
     return nodes[:count].copy()
 
 
-class Masses(NamedTuple):
-    """Masses and damping of nodes (n,); (0,) without damping."""
-
-    mass: np.ndarray
-    damping: np.ndarray
-
-
-@kernel
-def unpressed(nodes, v, a, contact, masses, alpha, eta):
-    """Return velocities and accelerations (m, 3) of nodes (m,) without the contact forces (owned, 3)."""
-    mass, damping = masses.mass, masses.damping
-    free_v, free_a = np.empty((len(nodes), 3)), np.empty((len(nodes), 3))
-    damped = len(damping) > 0
-    for j in range(len(nodes)):
-        i = nodes[j]
-        k = alpha * mass[i] + (eta * damping[i] if damped else 0.0)
-        for c in range(3):
-            u = contact[i, c] / k
-            free_v[j, c] = v[i, c] - eta * u
-            free_a[j, c] = a[i, c] - alpha * u
-    return free_v, free_a
-
-
-class Approach(NamedTuple):
-    """Nodes (m,) near walls (w,) at the start of a step.
-
-    Attributes
-    ----------
-    normals, gaps : (m, w, 3), (m, w) [m]
-    v, a : (m, 3) without contact
-    rates, pulls : (m, w, 3), (w, 3) velocities and accelerations of the walls
-    """
-
-    normals: np.ndarray
-    gaps: np.ndarray
-    v: np.ndarray
-    a: np.ndarray
-    rates: np.ndarray
-    pulls: np.ndarray
-
-
 @record
 class Touched(NamedTuple):
     """Contacts of the nodes (owned,) of a rank with walls (w,).
@@ -85,6 +43,7 @@ class Touched(NamedTuple):
     closed : (owned, w) bool, contacts that have closed and whose node has not left the wall; updated
     fixed : (owned, 3) bool, prescribed components
     restitution : (w,)
+    counted : (w,) bool, walls that contribute to the energy that closing contacts lose
     slack : distance at which a node has left [m]
     """
 
@@ -92,26 +51,37 @@ class Touched(NamedTuple):
     closed: np.ndarray
     fixed: np.ndarray
     restitution: np.ndarray
+    counted: np.ndarray
     slack: float
 
 
 @kernel
-def stop_nodes(nodes, approach, touched, mass, counted, speeds):
-    """Return the energy [J] that nodes (m,) lose when they close on walls, and the nodes that are on walls afterwards.
+def closed_nodes(nodes, touched):
+    """Return those nodes that are on walls or have not left them yet."""
+    found, count = np.empty_like(nodes), 0
+    for i in nodes:
+        if touched.closed[i].any():
+            found[count] = i
+            count += 1
+    return found[:count].copy()
+
+
+@kernel
+def stop_nodes(nodes, normals, gaps, speeds, towards, touched, mass):
+    """Mark contacts of nodes (m,) that have closed or opened, and return the energy [J] that they lose by closing.
 
     Parameters
     ----------
-    approach, touched : see :class:`Approach` and :class:`Touched`
+    normals, gaps : (m, w, 3), (m, w) of walls [m]
+    speeds : (m, w) velocities of the nodes along the normals beside those of the walls, without contact [m/s]; replaced
+        by approach velocities of closing contacts, else zero
+    towards : (m, w) accelerations of the nodes towards the walls, without contact [m/s2]
+    touched : Touched
     mass : (owned,)
-    counted : (w,) bool, walls that contribute to the energy
-    speeds : (m, w) output: approach velocities of closing contacts, else zero [m/s]
     """
-    normals, gaps, v, a, rates, pulls = approach
     touching, closed, fixed = touched.touching, touched.closed, touched.fixed
-    restitution, slack = touched.restitution, touched.slack
+    restitution, counted, slack = touched.restitution, touched.counted, touched.slack
     w = closed.shape[1]
-    met = np.empty(len(nodes), dtype=np.int64)
-    count = 0
     loss = 0.0
     basis = np.empty((3, 3))
     row = np.empty(3)
@@ -119,26 +89,17 @@ def stop_nodes(nodes, approach, touched, mass, counted, speeds):
     for j in range(len(nodes)):
         i = nodes[j]
         fresh = False
-        here = False
         for k in range(w):
-            speeds[j, k] = 0.0
+            speed, speeds[j, k] = speeds[j, k], 0.0
             if touching[i, k]:
                 if not closed[i, k]:
                     closed[i, k] = True
-                    speed, towards = 0.0, 0.0
-                    for c in range(3):
-                        speed += normals[j, k, c] * (v[j, c] - rates[j, k, c])
-                        towards -= normals[j, k, c] * (a[j, c] - pulls[k, c])
                     if speed < 0.0:
-                        square = speed * speed + 2.0 * towards * max(gaps[j, k], 0.0)
+                        square = speed * speed + 2.0 * towards[j, k] * max(gaps[j, k], 0.0)
                         speeds[j, k] = np.sqrt(max(square, 0.0))
                         fresh = fresh or counted[k]
             elif closed[i, k] and gaps[j, k] > slack:
                 closed[i, k] = False
-            here = here or closed[i, k]
-        if here:
-            met[count] = i
-            count += 1
         if not fresh:
             continue
         # the minimum-norm velocity with these components along the normals, from an orthogonal basis of their span
@@ -165,31 +126,30 @@ def stop_nodes(nodes, approach, touched, mass, counted, speeds):
                 size += 1
         for b in range(size):
             loss += 0.5 * mass[i] * (before[b] * before[b] - after[b] * after[b])
-    return loss, met[:count].copy()
+    return loss
 
 
 class Impacts:
-    """Closing contacts of this rank's nodes, step by step.
-
-    Attributes
-    ----------
-    met : (m,) owned nodes that have touched walls and not left them yet; ``stepper.closed`` (owned, walls) marks these
-        walls
-    """
+    """Closing contacts of this rank's nodes, step by step."""
 
     def __init__(self, stepper: Stepper) -> None:
         self.stepper = stepper
         self.model = stepper.model
         contact = self.model.contact
-        self.met = np.flatnonzero(stepper.closed.any(axis=1))
         self.active = self.model.can_touch and stepper.scheme.inertial
         bodies = contact.motion.bodies
-        self.counted = ~np.isin(contact.wall_of, bodies.at)
+        self._counted = ~np.isin(contact.wall_of, bodies.at)
         self._free_rates = bodies.state.v  # at the start of the step
         self.slack = ON_BOUND * self.model.size
         treatment = stepper.treatment
         # nothing is lost if nodes have no mass along the normal, or if a treatment restores the work of contact
         self.elastic = treatment is not None and treatment.elastic
+
+    @property
+    def touched(self) -> Touched:
+        """The contacts of this rank's nodes."""
+        contact, log = self.model.contact, self.model.contact.log
+        return Touched(log.touching, log.closed, contact.fixed, contact.restitution, self._counted, self.slack)
 
     def step(
         self,
@@ -213,41 +173,28 @@ class Impacts:
         """
         if not self.active:
             return 0.0
-        loss, contact, log = 0.0, self.model.contact, self.model.contact.log
-        if contact.any and (len(self.met) or len(log.last) or contact.motion.bodies.any):
-            around, closed = join_nodes(self.met, log.last, log.present), self.stepper.closed
-            changing = around[(log.touching[around] != closed[around]).any(axis=1)]
+        loss, log = 0.0, self.model.contact.log
+        if self.model.contact.any:
+            changing = np.flatnonzero((log.touching != log.closed).any(axis=1))
             loss = self.on_walls(changing, x, motion, load, time, poses)
-            self.met = around[closed[around].any(axis=1)]
         if len(self.model.links.two.at):
             loss += self.of_rows(x, motion, load)
         return 0.0 if self.elastic else loss
 
-    def _free(self, nodes: np.ndarray, motion: tuple[np.ndarray, np.ndarray], load: np.ndarray | None) -> tuple:
+    def _free(
+        self, nodes: np.ndarray, motion: tuple[np.ndarray, np.ndarray], load: np.ndarray | None
+    ) -> tuple[np.ndarray, np.ndarray]:
         """Return velocities and accelerations (m, 3) without contact at the start of the step."""
-        inertia, state = self.model.inertia, self.stepper.state
-        v, a = motion
+        inertia, balance, (v, a) = self.model.inertia, self.stepper.balance, (each[nodes] for each in motion)
         if load is None and inertia.products:
-            return v[nodes], a[nodes]
-        if load is None:
-            balance = self.stepper.balance
-            damping = inertia.damping if inertia.damped else np.empty(0)
-            return self._guided(
-                nodes,
-                motion,
-                *unpressed(nodes, v, a, state.contact, Masses(inertia.mass, damping), balance.alpha, balance.eta),
-            )
-        free_v, load = v[nodes], load[nodes]
-        if inertia.damped:
-            load = load - inertia.damping[nodes, None] * free_v
-        return self._guided(nodes, motion, free_v, load / inertia.mass[nodes, None])
-
-    def _guided(self, nodes: np.ndarray, motion: tuple[np.ndarray, np.ndarray], v: np.ndarray, a: np.ndarray) -> tuple:
-        """Return velocities and accelerations (m, 3) with the prescribed components inserted."""
-        fixed = self.model.supports.fixed[nodes]
-        if not fixed.any():
             return v, a
-        return np.where(fixed, motion[0][nodes], v), np.where(fixed, motion[1][nodes], a)
+        fixed, mass = self.model.supports.fixed[nodes], inertia.mass[nodes, None]
+        damping = inertia.damping[nodes, None] if inertia.damped else 0.0
+        if load is not None:
+            return v, np.where(fixed, a, (load[nodes] - damping * v) / mass)
+        u = self.stepper.state.contact[nodes] / (balance.alpha * mass + balance.eta * damping)
+        u[fixed] = 0.0  # prescribed components are not changed by contact
+        return v - balance.eta * u, a - balance.alpha * u
 
     def on_walls(
         self,
@@ -260,19 +207,16 @@ class Impacts:
     ) -> float:
         """Return the loss of nodes (m,) that begin or cease to touch walls, see :meth:`step`. Collective with walls
         with mass."""
-        contact, log = self.model.contact, self.model.contact.log
+        contact = self.model.contact
         free, last = contact.motion.bodies, self._free_rates
         self._free_rates = free.state.v
         if len(nodes) == 0 and (not free.any or self.model.comm.size == 1):
             return 0.0
-        nodes = np.sort(nodes)  # sums do not depend on when nodes met walls, which a restart does not know
-        if contact.plain and not free.any:
-            normals, gaps = wall_gaps(nodes, x, contact.surfaces.at(poses.shifts[contact.wall_of]))
-        else:
-            every = np.ones((len(nodes), len(contact.wall_of)), dtype=bool)
-            normals, gaps = contact.distances(every, x[nodes], poses, nodes)
+        nodes = np.sort(nodes)  # sums do not depend on when nodes met walls
+        every = np.ones((len(nodes), len(contact.wall_of)), dtype=bool)
+        normals, gaps = contact.distances(every, x[nodes], poses, nodes)
         free_v, free_a = self._free(nodes, motion, load)
-        rates, speeds = contact.rates(x[nodes], time, ahead=True), np.empty(gaps.shape)
+        rates = contact.rates(x[nodes], time, ahead=True)
         pulls = np.zeros((len(contact.names), 3))
         if free.any:
             pulls[free.at] = np.where(free.hinged[:, None], 0.0, free.weight / free.mass[:, None])
@@ -280,9 +224,9 @@ class Impacts:
             linear[free.at], angular[free.at] = free.changes(None if load is None else last)
             unpushed = linear + np.cross(angular, contact.motion.arms(x[nodes], time))
             rates = rates + unpushed[:, contact.wall_of]
-        approach = Approach(normals, gaps, free_v, free_a, np.ascontiguousarray(rates), pulls[contact.wall_of])
-        touched = Touched(log.touching, self.stepper.closed, contact.fixed, contact.restitution, self.slack)
-        loss, _ = stop_nodes(nodes, approach, touched, self.model.inertia.mass, self.counted, speeds)
+        relative = free_v[:, None, :] - rates, pulls[contact.wall_of] - free_a[:, None, :]
+        speeds, towards = (np.einsum("mwc,mwc->mw", normals, each, order="C") for each in relative)
+        loss = stop_nodes(nodes, normals, gaps, speeds, towards, self.touched, self.model.inertia.mass)
         if contact.ties.any:
             loss += self._tied(nodes, normals, speeds, free_v, rates)
         if free.any:

@@ -433,9 +433,9 @@ class ImplicitStepper(Stepper):
         extrapolate(self.state.a, self.differences, self.orders, 1.0 / balance.alpha, guess)
         return guess
 
-    def _finish(self, end: float) -> None:
+    def _make_balance(self, end: float) -> None:
         before = self.state.a
-        super()._finish(end)
+        super()._make_balance(end)
         if self.scheme.inertial:
             extend(before, self.state.a, self.differences, self.orders)
 

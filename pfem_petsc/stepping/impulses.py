@@ -159,17 +159,13 @@ class Impulses:
         u = (load if balance.a_hat is None else load - balance.a_hat) / balance.alpha
         stepper.scheme.finish(state, balance, u, part)
         for name, change in stepper.prescribed.change.items():
-            particles = getattr(state, name) if name in ("v", "a") else state.memory[name]
-            particles[SUPPORT] += change
+            state.rates[name][SUPPORT] += change
 
     def jump(self) -> None:
         """Add the velocity jumps of the treatment in this step."""
-        stepper, state = self.stepper, self.state
-        jump = stepper.treatment.jump
+        stepper, state, jump = self.stepper, self.state, self.stepper.jump
         for name, before in (("v", jump.v), ("a", jump.a), *jump.memory.items()):
-            mine = getattr(state, name) if name in ("v", "a") else state.memory[name]
-            of_nodes = getattr(stepper.state, name) if name in ("v", "a") else stepper.state.memory[name]
-            self._add(mine, jump.nodes, jump.walls, of_nodes[jump.nodes] - before)
+            self._add(state.rates[name], jump.nodes, jump.walls, stepper.state.rates[name][jump.nodes] - before)
 
     def _of_walls(self) -> np.ndarray:
         """Return the impulses of walls (walls, 3), jumps included [N s]."""
@@ -244,9 +240,6 @@ class NoImpulses(Impulses):
         walls = self.stepper.solution.walls
         torques = self._torques(walls.force, walls.moment) if self._turning else np.zeros(0)
         return walls.force.copy(), torques
-
-    def jump(self) -> None:
-        """Nothing."""
 
     def mean_pushes(self) -> tuple[np.ndarray, np.ndarray]:
         """Return the means of forces and moments of walls before and after the last step, (walls, 3) [N] and (walls,)

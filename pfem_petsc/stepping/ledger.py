@@ -259,10 +259,12 @@ class Ledger:
         present = after = moment_of(self.stepper)
         before, self._before = self._before, after
         self.powers = None
-        jumped = 0.0
-        jump = stepper.treatment.jump if stepper.treatment is not None else None
-        if jump is not None:
-            after, jumped = self._before_jump(after)
+        jump, jumped = stepper.jump, 0.0
+        if jump is not None:  # a work of contact
+            v, a = self._before_jump()
+            inertial, damping = self.model.inertia.mass_times(a, np.empty_like(a)), damping_force(stepper, v)
+            after = replace(present, inertial=inertial, damping=damping, contact=stepper.state.contact)
+            jumped = jump.energy
         first, second = (before, after) if stepper.scheme.balance_at_endpoints else 2 * (balanced(stepper, before),)
         works = self._works(0.5 * (stepper.state.position - stepper.before[:owned]), first, second)
         self.impulses.step(self._sum_state(present, second), stepper.part)
@@ -327,31 +329,26 @@ class Ledger:
     def begin_compiled(self) -> None:
         """Continue the works balance by balance, after a step."""
         stepper, present, h, sums = self.stepper, self._before, self.stepper.h, self.sums
-        v, a = present.velocity, present.acceleration
-        way, half_square = (0.5 * h) * (v - (0.5 * h) * a), 0.125 * h * h * power(present.inertial, a)
-        forces = [(EXTERNAL, present.external), (CONTACT, present.contact), (DAMPING, present.damping)]
-        forces.append((INTERNAL, present.internal))
-        supports = self.model.supports
-        carried = 0.0
-        if supports.moves:  # works are over the ways between positions, and inertia is that of the motion
-            way, v, mass = way.copy(), v.copy(), self.model.inertia.mass[supports.every_node]
-            half_way = supports.get(0.5 * (stepper.state.position - stepper.before[: len(v)]))
-            centre = half_way / h + 0.5 * supports.get(stepper.state.memory["half_velocity"])
-            speed, rate = supports.get(v), supports.get(a)
-            half_square += float((mass * (0.5 * speed * speed - rate * half_way - 0.125 * h * h * rate * rate)).sum())
-            carried = h * float((mass * rate * centre).sum())
-            supports.put(way, half_way)
-            supports.put(v, centre)
-            forces.append((EXTERNAL, present.support))
+        a, supports = present.acceleration, self.model.supports
+        ahead = (0.5 * h) * stepper.state.memory["half_velocity"]  # the way of the second half of the balance
         self.powers = np.zeros(len(WORKS))
-        self.powers[EXTERNAL] = sums[_AT["external_work"]]
-        self.powers[DAMPING] = sums[_AT["damping_dissipation"]]
+        for k in (EXTERNAL, CONTACT, DAMPING, INTERNAL):
+            self.powers[k] = power(getattr(present, WORKS[k]), ahead)
+        inertial = 0.125 * h * h * power(present.inertial, a)
+        if supports.moves:  # works are over the ways between positions, and inertia is that of the motion
+            mass, speed, rate = (
+                self.model.inertia.mass[supports.every_node],
+                supports.get(present.velocity),
+                supports.get(a),
+            )
+            kinetic = 0.5 * speed * speed - 0.125 * h * h * rate * rate
+            inertial += float((mass * (kinetic + rate * supports.get(ahead))).sum())
+            self.powers[EXTERNAL] += power(present.support, ahead)
+        self.powers[EXTERNAL] += sums[_AT["external_work"]]
+        self.powers[DAMPING] += sums[_AT["damping_dissipation"]]
         impact, numerical = sums[_AT["impact_dissipation"]], sums[_AT["numerical_dissipation"]]
         rubbed = sums[_AT["friction_dissipation"]] - sums[_AT["contact_work"]]
-        self.powers[INERTIAL] = numerical + half_square + present.energy.total + impact + carried + rubbed
-        for k, force in forces:
-            if force is not stepper.zero:
-                self.powers[k] += h * power(force, v) - power(force, way)
+        self.powers[INERTIAL] = numerical + inertial + present.energy.total + impact + rubbed
         self._release()
 
     def _release(self) -> None:
@@ -425,16 +422,17 @@ class Ledger:
 
         With a consistent mass, where a force accelerates other nodes too, the acceleration is that before the step.
         """
-        state, balance, jump = self.stepper.state, self.stepper.balance, None
-        if self.stepper.treatment is not None:
-            jump = self.stepper.treatment.jump
-        v, a = state.v, state.a
+        balance, (v, a), earlier = self.stepper.balance, self._before_jump(), before.acceleration
+        if self.model.inertia.products:
+            return v + (balance.eta / balance.alpha) * (earlier - a), earlier
+        return v, a
+
+    def _before_jump(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return velocity and acceleration (owned, 3) before velocity jumps of the last step."""
+        jump, v, a = self.stepper.jump, self.stepper.state.v, self.stepper.state.a
         if jump is not None:
             v, a = v.copy(), a.copy()
             v[jump.nodes], a[jump.nodes] = jump.v, jump.a
-        if self.model.inertia.products:
-            earlier = before.acceleration
-            return v + (balance.eta / balance.alpha) * (earlier - a), earlier
         return v, a
 
     def _walls_before(self) -> None:
@@ -494,15 +492,6 @@ class Ledger:
         bodies = self.model.contact.motion.bodies
         self._bodies = bodies.motion
         self.sums[_AT["wall_kinetic_energy"]] = bodies.kinetic if self.model.comm.rank == 0 else 0.0
-
-    def _before_jump(self, after: Moment) -> tuple[Moment, float]:
-        """Return the end of the step before velocity jumps, and the energy of the jumps [J], a work of contact."""
-        stepper, inertia = self.stepper, self.model.inertia
-        jump = stepper.treatment.jump
-        a, v = after.acceleration.copy(), after.velocity.copy()
-        a[jump.nodes], v[jump.nodes] = jump.a, jump.v
-        inertial, damping = inertia.mass_times(a, np.empty_like(a)), damping_force(stepper, v)
-        return replace(after, inertial=inertial, damping=damping, contact=stepper.state.contact), jump.energy
 
     def follow_removal(self) -> None:
         """Start the next step from the energies and stresses of the bars after some were removed, as a restart does."""

@@ -27,6 +27,16 @@ SUPPORTS, LOADS, DRAGS = range(3)
 FAILED, LOST = -1, -2
 """Results of calls of Python: a failure of the simulation, any other error."""
 
+NEEDS_ENERGIES, HOLDS, DONE, PASSED, RECORDED, MPI_ERROR = range(6)
+CHANGED, SHORTENED, COLLAPSED, TURNED, INFEASIBLE, WHY, UNSOLVED, NEAR, PRESSING = range(6, 15)
+"""Numbers of the course of a call: whether a step needs energies; whether a condition holds here, and after
+:func:`~pfem_petsc.stepping.compiled_loop.agree` on any rank; numbers of steps made, of those that other ranks make too,
+of which this one only sends messages after a failure, and of shares of rows; the error code of MPI. Of the last step:
+the number of bars that changed their state of rupture; whether bars need a look for one that has gone through zero
+length; the first bar that collapsed, the first that went through zero length, and the first node of ContactNodes that
+walls leave no place, or -1, and why; what a call of Python returned; the number of nodes beyond walls or that rebound,
+in ContactNodes; and of nodes with contact forces."""
+
 
 @record
 class Nodes(NamedTuple):
@@ -49,7 +59,7 @@ class Nodes(NamedTuple):
 @record
 class Motion(NamedTuple):
     """What moves: the step h [s]; positions and internal forces of local nodes, (3, stride); of owned nodes velocities
-    at half steps, and increments, which are written in steps that need them, (3, n); and contact forces (n, 3)."""
+    at half steps, and increments, (3, n); and contact forces (n, 3)."""
 
     h: float
     x: np.ndarray
@@ -95,14 +105,12 @@ class MovingSupports(NamedTuple):
     origins : (p,) positions without displacement [m]
     motions : (t, 3, m) displacements, velocities and accelerations of all motions at the start of the first step, at
         the end of each, and of one more
-    probed : (q, 2) which of the components are at probes, and at which
     """
 
     at: np.ndarray
     columns: np.ndarray
     origins: np.ndarray
     motions: np.ndarray
-    probed: np.ndarray
 
 
 @record
@@ -192,38 +200,21 @@ def place_supports(s, step):
 
 
 @inlined
-def _advance(f, inverse, h, half):
-    """Solve balances with internal forces alone and advance ``half``; return the power of the forces."""
-    rate, eta, power = 1.0 / h, 0.5 / h, 0.0
-    for i in range(len(half)):
-        u = -f[i] * inverse[i]
-        half[i] += rate * u
-        power = add_freely(power, f[i] * (half[i] - eta * u))
-    return power
-
-
-@inlined
-def _advance_kept(f, inverse, h, half, u):
-    """The same, and write the increments."""
-    rate, eta, power = 1.0 / h, 0.5 / h, 0.0
-    for i in range(len(half)):
-        u[i] = -f[i] * inverse[i]
-        half[i] += rate * u[i]
-        power = add_freely(power, f[i] * (half[i] - eta * u[i]))
-    return power
-
-
-@inlined
-def _advance_loaded(f, external, inverse, h, half, u):
-    """The same with loads; return the powers of the forces of bars and of the loads, and the sum of these."""
+def _advance(f, external, inverse, h, half, u):
+    """Solve the balances of a component with the forces of bars and loads, None for none, advance ``half``, and write
+    the increments; return the powers of both, and the sum of the loads."""
     rate, eta, power, given, total = 1.0 / h, 0.5 / h, 0.0, 0.0, 0.0
     for i in range(len(half)):
-        u[i] = (external[i] - f[i]) * inverse[i]
+        force = -f[i]
+        if external is not None:
+            force += external[i]
+        u[i] = force * inverse[i]
         half[i] += rate * u[i]
         v = half[i] - eta * u[i]
         power = add_freely(power, f[i] * v)
-        given = add_freely(given, external[i] * v)
-        total = add_freely(total, external[i])
+        if external is not None:
+            given = add_freely(given, external[i] * v)
+            total = add_freely(total, external[i])
     return power, given, total
 
 
@@ -266,7 +257,7 @@ def _load(external, h, half, u):
 @cache
 def balancing(loaded: bool, damped: bool) -> Any:
     """Make the phase that solves the balances of all nodes without supports and contact, and begins the sums of the
-    step; increments are written in steps that need them, and always with loads or dampers."""
+    step."""
 
     @addressed
     def balance(s, step):
@@ -286,11 +277,9 @@ def balancing(loaded: bool, damped: bool) -> Any:
                 if loaded:
                     forces[LOADS, c], given = _load(external[c], h, half[c], u[c])
             elif loaded:
-                power, given, forces[LOADS, c] = _advance_loaded(f[c], external[c], nodes.inverse, h, half[c], u[c])
-            elif s.course.keeps:
-                power = _advance_kept(f[c], nodes.inverse, h, half[c], u[c])
+                power, given, forces[LOADS, c] = _advance(f[c], external[c], nodes.inverse, h, half[c], u[c])
             else:
-                power = _advance(f[c], nodes.inverse, h, half[c])
+                power, _, _ = _advance(f[c], None, nodes.inverse, h, half[c], u[c])
             works[INTERNAL] += h * power
             works[EXTERNAL] += h * given
 
@@ -355,16 +344,6 @@ def work_of_contact(touched, motion, sums):
 
 
 @inlined
-def restore_increments(nodes, motion, held):
-    """Write the increments of a step that has not kept them, which has neither loads nor dampers nor contact."""
-    for c in range(3):
-        for i in range(len(nodes.inverse)):
-            motion.u[c, i] = -motion.f[c, i] * nodes.inverse[i]
-    for k in range(len(held.nodes)):
-        motion.u[held.components[k], held.nodes[k]] = held.u[k]
-
-
-@inlined
 def rates_of(i, motion, v, a):
     """Write velocity and acceleration of the balance at node i to ``v``, ``a`` (n, 3)."""
     h = motion.h
@@ -406,11 +385,11 @@ def correct_moving(s, step):
         jumps[1, c] += mass * (speed - (motion.half[c, i] - h * a + 0.5 * h * rate))
 
 
-@inlined
-def correct_moving_ends(moving, step, held, nodes, motion, sums, values):
-    """Correct the sums at the end of a step, and the ``values`` (p, 4, 3) of probes, for supports that move."""
-    h, x, damped = motion.h, motion.x, len(nodes.damping) > 0
-    works, momenta = sums.ends, sums.momenta
+@addressed
+def correct_moving_ends(s, step):
+    """Correct the sums at the end of a step, and the impulses, for supports that move."""
+    moving, held, nodes, motion, sums = s.moving, s.held, s.nodes, s.motion, s.sums
+    h, x, damped, works, momenta = motion.h, motion.x, len(nodes.damping) > 0, sums.ends, sums.momenta
     for p in range(len(moving.at)):
         i, c, v, a = _scheme_rates(p, moving, held, motion)
         speed, rate = moving.motions[step + 1, 1, moving.columns[p]], moving.motions[step + 1, 2, moving.columns[p]]
@@ -425,11 +404,8 @@ def correct_moving_ends(moving, step, held, nodes, motion, sums, values):
         momenta[0, c] += momentum
         momenta[1, one] += x[other, i] * momentum
         momenta[1, other] -= x[one, i] * momentum
-    for k in range(len(moving.probed)):
-        p, at = moving.probed[k, 0], moving.probed[k, 1]
-        c = held.components[moving.at[p]]
-        values[at, 1, c] = moving.motions[step + 1, 1, moving.columns[p]]
-        values[at, 2, c] = moving.motions[step + 1, 2, moving.columns[p]]
+    for c in range(3):
+        s.impulses.v[SUPPORTS, c] += sums.jumps[1, c]
 
 
 @inlined
@@ -462,18 +438,16 @@ def accumulate(nodes, motion, touched, sums):
 
 @addressed
 def accumulate_loads(s, step):
-    """Write the work of loads over the last half of a step."""
-    motion = s.motion
+    """Write the works of loads and of dampers over the last half of a step, (h half - u)/2."""
+    h, given, taken = s.motion.h, 0.0, 0.0
     for c in range(3):
-        s.sums.ends[EXTERNAL] += _sum_left(s.nodes.external[c], motion.half[c], motion.u[c], motion.h)
-
-
-@addressed
-def accumulate_drags(s, step):
-    """Write what dampers take over the last half of a step."""
-    motion = s.motion
-    for c in range(3):
-        s.sums.ends[DAMPING] += _sum_drag_left(s.nodes.damping, motion.half[c], motion.u[c], motion.h)
+        external, damping, half, u = s.nodes.external[c], s.nodes.damping, s.motion.half[c], s.motion.u[c]
+        for i in range(len(external)):
+            given = add_freely(given, external[i] * (0.5 * (h * half[i] - u[i])))
+        for i in range(len(damping)):
+            taken = add_freely(taken, damping[i] * (half[i] - 0.5 / h * u[i]) * (0.5 * (h * half[i] - u[i])))
+    s.sums.ends[EXTERNAL] += given
+    s.sums.ends[DAMPING] += taken
 
 
 @inlined
@@ -500,24 +474,6 @@ def _sum_turn(components, mass, h):
         moment = add_freely(moment, m * x[i])
         turned = add_freely(turned, m * (x[i] * (rate[i] - eta * w[i]) - y[i] * (half[i] - eta * u[i])))
     return turned, moment
-
-
-@inlined
-def _sum_left(external, half, u, h):
-    """Return the work of loads over the last half of the step, (h half - u)/2."""
-    total = 0.0
-    for i in range(len(external)):
-        total = add_freely(total, external[i] * (0.5 * (h * half[i] - u[i])))
-    return total
-
-
-@inlined
-def _sum_drag_left(damping, half, u, h):
-    """Return what dampers take over the last half of the step."""
-    eta, total = 0.5 / h, 0.0
-    for i in range(len(damping)):
-        total = add_freely(total, damping[i] * (half[i] - eta * u[i]) * (0.5 * (h * half[i] - u[i])))
-    return total
 
 
 def power(force: np.ndarray, v: np.ndarray) -> float:

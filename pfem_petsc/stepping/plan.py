@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, field, replace
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -219,10 +219,8 @@ def make_plan(model: Model, recorded: Mapping[str, Any] | None = None) -> Plan:
     time = case.time
     scheme = lookup("pfem_petsc.integrators", time.integrator, f"{case.source}: time.integrator").Scheme(time.scheme)
     _check_laws(case, scheme)
-    if recorded is None:
-        frequency = _highest_frequency(model)
-    else:
-        frequency = Frequency(*recorded["frequency"])
+    kept = recorded or {}
+    frequency = Frequency(*kept["frequency"]) if kept else _highest_frequency(model)
     if not np.isfinite(frequency.upper):
         raise InputError(
             f"{case.source}: material: the stiffness of the bars over their mass overflows double precision: correct "
@@ -241,9 +239,8 @@ def make_plan(model: Model, recorded: Mapping[str, Any] | None = None) -> Plan:
     viscous = viscous_rate(case, model.bars, model.inertia.mass, model.inertia.consistent)
     critical = _stable_step(scheme, min(ratio + local, 1e3), frequency.upper, max(betas), viscous)
     certain = _stable_step(scheme, min(ratio, 1e3), frequency.lower, min(betas))
-    if recorded is not None:
-        step = float(recorded["step"])
-        steps = _steps_to(time.end, step, case.source)
+    if kept:
+        step = float(kept["step"])
     elif time.step == "auto":
         if not np.isfinite(critical):
             raise InputError(
@@ -251,8 +248,7 @@ def make_plan(model: Model, recorded: Mapping[str, Any] | None = None) -> Plan:
                 "springs resist the free nodes; give time.step [s]"
             )
         safety = time.safety if model.self_contact is None else WITH_CONTACT * time.safety
-        steps = _steps_to(time.end, safety * critical, case.source)
-        step = time.end / steps
+        step = time.end / _steps_to(time.end, safety * critical, case.source)
     else:
         step = float(time.step)
         if step > certain * (1.0 + TIME):
@@ -260,20 +256,20 @@ def make_plan(model: Model, recorded: Mapping[str, Any] | None = None) -> Plan:
                 f"{case.source}: time.step = {step:g} s is above the limit of {time.integrator}, which is unstable "
                 f'beyond {critical:.6g} s for this model; reduce it, or use time.step = "auto"'
             )
-        steps = _steps_to(time.end, step, case.source)
         if step > time.end * (1.0 + TIME):
             model.warnings.append(
                 f"time.step = {step:g} s is longer than time.end = {time.end:g} s: the run makes one step, "
                 f"to t = {step:g} s"
             )
+    steps = _steps_to(time.end, step, case.source)
     asked = case.solver.linear, case.solver.operator
     linear = None
     if not scheme.explicit or model.inertia.consistent:
-        kept = None if recorded is None else recorded.get("linear")
-        if kept is not None and tuple(kept["asked"]) == asked:
+        known = kept.get("linear")
+        if known is not None and tuple(known["asked"]) == asked:
             from ..solvers.linear import LinearChoice
 
-            linear = LinearChoice(**kept["choice"])
+            linear = LinearChoice(**known["choice"])
         else:
             linear = _linear(model, scheme, 0.0 if scheme.explicit else step * frequency.upper / 2.0, steps)
     parameters = ", ".join(f"{key} = {value:g}" for key, value in time.scheme.model_dump().items())
@@ -387,8 +383,7 @@ def make_stepper(model: Model, plan: Plan) -> Stepper:
     if model.self_contact is not None:
         model.self_contact.begin(plan.scheme, plan.step, plan.frequency.upper, plan.critical_step)
     _check_walls(model, plan, treatment)
-    _warn_of_damping(model, plan)
-    _warn_of_drag(model, plan)
+    model.warnings += _warnings(model, plan)
     if treatment is not None:
         treatment.prepare(model)
     if plan.linear is not None:
@@ -403,8 +398,6 @@ def make_stepper(model: Model, plan: Plan) -> Stepper:
         stepper.treatment = treatment(stepper)
     elif (model.contact.restitution.any() or model.links.rows.rebounds) and not plan.scheme.solves_next_position:
         stepper.treatment = Restitution(stepper)
-    if model.can_touch:
-        _warn_of_gain(model, plan)
     return stepper
 
 
@@ -423,40 +416,32 @@ def _treatment(model: Model, plan: Plan) -> type[Treatment] | None:
     return treatment
 
 
-def _warn_of_gain(model: Model, plan: Plan) -> None:
-    """Warn if contact gains energy with this scheme, treatment, mass and step."""
-    fastest = plan.frequency.upper / (np.sqrt(3.0) if model.inertia.consistent else 1.0)
-    across = 0.5 * fastest * model.length / model.wave_speed
-    warning = warn_of_gain(model.case, 0.5 * fastest * plan.step, across)
-    if warning:
-        model.warnings.append(warning)
-
-
-def _warn_of_damping(model: Model, plan: Plan) -> None:
-    """Warn if damping stops nodes within a few steps, when no rule over steps gives its dissipation accurately."""
+def _warnings(model: Model, plan: Plan) -> Iterator[str]:
+    """Give what users should know about damping, drag and contact with this scheme, treatment, mass and step.
+    Collective."""
+    # where damping stops nodes within a few steps, no rule over steps gives its dissipation accurately
     rate = max(material.damping / material.density for material in model.case.material.values())
     rate = max(model.inertia.largest_factor * rate, dashpot_rate(model))
     if rate * plan.step > _DAMPED:
-        model.warnings.append(
+        yield (
             f"time.step = {plan.step:.4g} s: damping stops nodes within a few steps (material.damping / density, or "
             f"dashpot.coefficient / mass, * step = {rate * plan.step:.2g}), so the recorded damping dissipation has "
             f"an error of this order; use "
             f"a time.step of at most {_DAMPED / rate:.2g} s, or less damping"
         )
-
-
-def _warn_of_drag(model: Model, plan: Plan) -> None:
-    """Warn if drag stops bars within a few steps: by predicted velocities it is stable up to a rate of 2/3 a step."""
+    # drag by predicted velocities is stable up to a rate of 2/3 a step
     wind = model.external.wind
-    if wind is None:
-        return
-    rate = wind.rate(wind.fastest())
+    rate = 0.0 if wind is None else wind.rate(wind.fastest())
     if rate * plan.step > _DAMPED:
-        model.warnings.append(
+        yield (
             f"time.step = {plan.step:.4g} s: the drag of [wind] stops bars within a few steps (rho C_d d U / (density "
             f"area) * step = {rate * plan.step:.2g}), which its explicit evaluation does not follow; use a time.step "
             f"of at most {_DAMPED / rate:.2g} s"
         )
+    if model.can_touch:
+        fastest = plan.frequency.upper / (np.sqrt(3.0) if model.inertia.consistent else 1.0)
+        across = 0.5 * fastest * model.length / model.wave_speed
+        yield from filter(None, [warn_of_gain(model.case, 0.5 * fastest * plan.step, across)])
 
 
 def _check_walls(model: Model, plan: Plan, treatment: type[Treatment] | None) -> None:
@@ -500,17 +485,29 @@ def _check_walls(model: Model, plan: Plan, treatment: type[Treatment] | None) ->
 def _check_surface(model: Model, plan: Plan, treatment: type[Treatment] | None, keys: SurfaceKeys, key: str) -> bool:
     """Refuse friction and restitution that the scheme or treatment does not support; return whether the latter is a
     bound on the next position."""
-    rebounds, rough = False, keys.friction_coefficients[1] > 0.0
+    scheme, name, rough = plan.scheme, model.case.time.integrator, keys.friction_coefficients[1] > 0.0
     if keys.restitution:
-        rebounds = _check_restitution(model, plan, treatment, rough, key)
+        if model.inertia.consistent:
+            raise InputError(f'{key}: restitution needs time.mass = "lumped": one node\'s velocity jumps')
+        if not scheme.jumps_known:
+            raise InputError(
+                f"{key}: restitution with {name}, whose substeps differ, is not known; use another integrator"
+            )
+        if not scheme.solves_next_position:
+            _check_serves(treatment, "restitution", key)
+            # the impulse of a velocity jump causes no friction
+            if rough:
+                raise InputError(f"{key}: restitution together with friction needs central_differences")
+        elif treatment is not None:
+            raise InputError(f'{key}: with {name} restitution needs contact.treatment = "scheme"')
     if rough:
         _check_serves(treatment, "friction", key)
-        if treatment is not None and not plan.scheme.jumps_known:
+        if treatment is not None and not scheme.jumps_known:
             raise InputError(
-                f'{key}: friction with {model.case.time.integrator} needs contact.treatment = "scheme": the '
+                f'{key}: friction with {name} needs contact.treatment = "scheme": the '
                 "friction of velocity jumps is not known for it; use another treatment or integrator"
             )
-    return rebounds
+    return bool(keys.restitution) and scheme.solves_next_position
 
 
 def _check_serves(treatment: type[Treatment] | None, what: str, key: str) -> None:
@@ -520,22 +517,3 @@ def _check_serves(treatment: type[Treatment] | None, what: str, key: str) -> Non
     known = {name: lookup(TREATMENTS, name, "").Treatment for name in choices(TREATMENTS)}
     served = ['"scheme"', *(f'"{name}"' for name, other in known.items() if what in other.serves)]
     raise InputError(f"{key}: {what} needs contact.treatment = {' or '.join(served)}")
-
-
-def _check_restitution(model: Model, plan: Plan, treatment: type[Treatment] | None, rough: bool, key: str) -> bool:
-    if model.inertia.consistent:
-        raise InputError(f'{key}: restitution needs time.mass = "lumped": one node\'s velocity jumps')
-    if not plan.scheme.jumps_known:
-        raise InputError(
-            f"{key}: restitution with {model.case.time.integrator}, whose substeps differ, is not known; use "
-            "another integrator"
-        )
-    if plan.scheme.solves_next_position:
-        if treatment is not None:
-            raise InputError(f'{key}: with {model.case.time.integrator} restitution needs contact.treatment = "scheme"')
-        return True
-    _check_serves(treatment, "restitution", key)
-    # the impulse of a velocity jump causes no friction
-    if rough:
-        raise InputError(f"{key}: restitution together with friction needs central_differences")
-    return False

@@ -5,9 +5,10 @@ the state.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from operator import attrgetter
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -25,6 +26,7 @@ from ..tolerances import BEYOND, ON_BOUND, TIME
 from .bar_events import Collapse, Removals, Ruptures, collapse_message
 
 if TYPE_CHECKING:
+    from ..contact.treatments.base import Jump
     from .model import Model
 
 
@@ -81,8 +83,7 @@ class PrescribedMotion:
 
     def place(self, end: float) -> None:
         """Set prescribed components of the positions to their values at a time [s]."""
-        if self.moving:
-            self.supports.place(self.stepper.state.position, self.supports.positions(end))
+        self.supports.place(self.stepper.state.position, self.supports.positions(end))
 
     def prescribe(self, balance: Balance) -> None:
         """Set exact positions, velocities and accelerations of prescribed components in a balance; their increments are
@@ -117,29 +118,19 @@ class PrescribedMotion:
         supports, state = self.supports, self.stepper.state
         for array, values in zip((state.v, state.a), supports.rates(time, self.stepper.part), strict=True):
             supports.put(array, values)
-        self._restart()
+        along = self._along()
+        self.stepper.scheme.restart(along, np.arange(supports.number), self.stepper.part)
+        for name, values in along.memory.items():
+            supports.put(state.memory[name], values[:, 0])
         if self.stepper.scheme.solves_next_position:
             end = self.stepper.balance.time
             way = supports.positions(end) - supports.positions(time)
             supports.put(state.memory["half_velocity"], way / (end - time))
-        ruled, given = self._ruled, {"v": state.v, "a": state.a, **state.memory}
-        made = {"v": ruled.v, "a": ruled.a, **ruled.memory}
         self.change = {}  # the scheme may have no memory at the end of this balance
-        for name, array in made.items():
+        for name, array in self._ruled.rates.items():
             change = np.zeros_like(state.v)
-            supports.put(change, supports.get(given[name]) - array[:, 0])
+            supports.put(change, supports.get(state.rates[name]) - array[:, 0])
             self.change[name] = self.stepper.model.inertia.mass_times(change, np.empty_like(change)).sum(axis=0)
-
-    def _restart(self) -> None:
-        """Make the memory of the scheme consistent with the new velocities and accelerations."""
-        supports, state, scheme = self.supports, self.stepper.state, self.stepper.scheme
-        if supports.inclined is None:
-            scheme.restart(state, supports.at, self.stepper.part)
-            return
-        along = self._along()
-        scheme.restart(along, np.arange(supports.number), self.stepper.part)
-        for name, values in along.memory.items():
-            supports.put(state.memory[name], values[:, 0])
 
     def _along(self) -> State:
         """Return the state (k, 1) of the prescribed components."""
@@ -176,15 +167,15 @@ class AttributeOf:
     None, it is ``absent`` and nothing is set: a restart may have other settings."""
 
     def __init__(self, path: str, absent: Any = None) -> None:
-        self._part, self._name = path.split(".")
-        self._absent = absent
+        part, _, self._name = path.rpartition(".")
+        self._part, self._absent = attrgetter(part), absent
 
     def __get__(self, stepper: Stepper, owner: type | None = None) -> Any:
-        part = getattr(stepper, self._part)
+        part = self._part(stepper)
         return self._absent if part is None else getattr(part, self._name)
 
     def __set__(self, stepper: Stepper, value: Any) -> None:
-        part = getattr(stepper, self._part)
+        part = self._part(stepper)
         if part is not None:
             setattr(part, self._name, value)
 
@@ -211,6 +202,8 @@ class Stepper(ABC):
         nothing records
     iterations : numbers of Newton and linear iterations since the last row of the history
     before : (local, 3) positions at the start of the last part, with ghosts [m]
+    touching, closed : (owned, slots) bool, contacts of nodes with walls after the last step; nodes that have touched a
+        wall and not left it since
     massless : Redistribution if contact nodes are massless along their walls' normals, else None
     prescribed : PrescribedMotion of supports
     ruptures : Ruptures, which counts broken bars
@@ -239,6 +232,7 @@ class Stepper(ABC):
     kept_bars: tuple[str, ...] = ()
     columns: tuple[str, ...] = ()
     remedy = "reduce time.step"
+    touching, closed = AttributeOf("model.contact.log.touching"), AttributeOf("model.contact.log.closed")
     removal_times, removed_supports = AttributeOf("removals.times"), AttributeOf("removals.gone")
     removed_reactions = AttributeOf("removals.released")
     event_columns: Mapping[str, Any] = {}
@@ -286,24 +280,6 @@ class Stepper(ABC):
         self.solution = Solution(self.zero, self.state.f, model.contact.nothing)
 
     @property
-    def touching(self) -> np.ndarray:
-        """(owned, slots) bool: contacts of nodes with walls after the last step."""
-        return self.model.contact.log.touching
-
-    @touching.setter
-    def touching(self, touching: np.ndarray) -> None:
-        self.model.contact.log.touching = touching
-
-    @property
-    def closed(self) -> np.ndarray:
-        """(owned, slots) bool: nodes that have touched a wall and not left it since."""
-        return self.model.contact.log.closed
-
-    @closed.setter
-    def closed(self, closed: np.ndarray) -> None:
-        self.model.contact.log.closed = closed
-
-    @property
     def fault(self) -> SimulationFailure | None:
         """The first failure that only this rank knows; setting it stores the number of the last finished step."""
         return self._fault
@@ -321,8 +297,6 @@ class Stepper(ABC):
         supports = model.supports
         supports.place(state.position, supports.positions(0.0))
         supports.put(state.v, supports.rates(0.0, 0.0)[0])
-        if model.external.state_forces:
-            model.external.follow(state.position, state.v)
         if self.massless is not None and self.massless.settle(model, state.x, 0.0, 0.0) > BEYOND * model.size:
             self.fault = SimulationFailure(
                 "step 0, t = 0 s: contact nodes without mass found no equilibrium; use another contact.treatment"
@@ -360,8 +334,7 @@ class Stepper(ABC):
         if self.scheme.solves_next_position:
             v, speeds = state.v, bodies.state.v
             with self.turns_named():
-                for phase in (self._set_balance, self._solve_balance, self._finish):
-                    phase(state.time)
+                self._make_balance(state.time)
             self.totals_solved = self.totals()
             if model.inertia.damped:
                 self.velocity_solved = state.v
@@ -460,6 +433,11 @@ class Stepper(ABC):
         """A step and a time of the stage as they are counted in the results, for messages."""
         place = AXIS.exact(self.model.origin + time) if self.scheme.inertial else LOAD_FACTOR.exact(time)
         return f"step {self.model.first_step + step}, {place}"
+
+    @property
+    def jump(self) -> Jump | None:
+        """Velocity jumps of the treatment in the last part; None if there were none."""
+        return None if self.treatment is None else self.treatment.jump
 
     @property
     def number(self) -> int:
@@ -601,32 +579,31 @@ class Stepper(ABC):
 
     def _make_part(self, end: float) -> None:
         """Advance by ``part`` to the time ``end`` [s]."""
+        state, scheme, prescribed = self.state, self.scheme, self.prescribed
         with self.turns_named():
-            for phase in self._phases():
-                phase(end)
-
-    def _phases(self) -> tuple[Callable[[float], None], ...]:
-        """Return the phases of a step, methods of the time [s] at which its part ends, in their order."""
-        solve = self._set_balance, self._solve_balance, self._finish
-        last = self._treat, self._account, self._check
-        if self.scheme.solves_next_position:
-            return self._begin, self._move, self._evaluate_end, *solve, *last
-        return self._begin, *solve, self._place_supports, self._evaluate_end, *last
-
-    def _begin(self, end: float) -> None:
-        """Keep what later phases compare with the start of the part."""
-        state = self.state
-        if self.model.bars_vary:
-            self.model.bars.keep_start()
-        self.carried.start(state.position, state.time)
-        if self.treatment is not None:
-            self.treatment.before()
-
-    def _move(self, end: float) -> None:
-        """Move to the positions that the last balance was solved for, supports to their exact ones."""
-        self.before[:] = self.state.x
-        self.scheme.advance(self.state, self.part)
-        self.prescribed.place(end)
+            if self.model.bars_vary:
+                self.model.bars.keep_start()
+            self.carried.start(state.position, state.time)
+            if self.treatment is not None:
+                self.treatment.before()
+            if scheme.solves_next_position:  # move to the positions that the last balance was solved for
+                self.before[:] = state.x
+                scheme.advance(state, self.part)
+                if prescribed.moving:
+                    prescribed.place(end)
+                self._evaluate_end(end)
+            self._make_balance(end)
+            if not scheme.solves_next_position:
+                if prescribed.moving:
+                    prescribed.place(end)
+                    prescribed.take_rates(end)
+                self._evaluate_end(end)
+            if self.treatment is not None:
+                self.treatment.after()
+            self._account()
+            crossing = self.carried.of and self.carried.crossing(state.position, end, self.at(state.step + 1, end))
+            if crossing:
+                self.fault = SimulationFailure(crossing)
 
     def _evaluate_end(self, end: float) -> None:
         """Evaluate forces and energies at the positions reached, and keep the internal variables. Collective."""
@@ -637,80 +614,52 @@ class Stepper(ABC):
         model.change_bars(end)
         self.evaluate(commit=True)
 
-    def _set_balance(self, end: float) -> None:
-        """Set up the balance of the part, with the loads, supports, dampers and walls of its times. Collective."""
-        state, model = self.state, self.model
-        self.balance = self.scheme.balance(state, self.part)
+    def _make_balance(self, end: float) -> None:
+        """Solve the balance of the part, with the loads, supports, dampers and walls of its times; update velocities,
+        accelerations, walls and the contact log. Collective."""
+        state, model, scheme, contact = self.state, self.model, self.scheme, self.model.contact
+        self.balance = balance = scheme.balance(state, self.part)
         if self.prescribed.moving:
-            self.prescribed.prescribe(self.balance)
+            self.prescribed.prescribe(balance)
         # exactly the end, at which a continued run takes the damping of the state it starts from
-        mean = sum(weight * time for weight, time in self.balance.loads)
-        model.inertia.change(end if self.scheme.balance_at_endpoints else mean)
-        model.contact.motion.bodies.begin(state.time, self.part)
-        state.external = self.load_of(self.balance)
-        if self.scheme.inertial:
-            model.bars.step = self.balance.time - state.time
-
-    def _solve_balance(self, end: float) -> None:
-        """Solve the balance with contact and supports. Collective if the solve is."""
-        self.solution = self.solve(self.balance)
-
-    def _finish(self, end: float) -> None:
-        """Update velocities, accelerations, walls and the contact log from the solution."""
-        state, scheme, contact, found = self.state, self.scheme, self.model.contact, self.balance
-        fresh = contact.record(self.solution.walls, found.time, self.part)
+        mean = sum(weight * time for weight, time in balance.loads)
+        model.inertia.change(end if scheme.balance_at_endpoints else mean)
+        contact.motion.bodies.begin(state.time, self.part)
+        state.external = self.load_of(balance)
+        if scheme.inertial:
+            model.bars.step = balance.time - state.time
+        self.solution = self.solve(balance)
+        fresh = contact.record(self.solution.walls, balance.time, self.part)
         if not scheme.solves_next_position:
             self.before[:] = state.x
-        scheme.finish(state, found, self.solution.u, self.part)
+        scheme.finish(state, balance, self.solution.u, self.part)
         if scheme.solves_next_position and self.prescribed.moving:
             self.prescribed.take_rates(state.time)
         contact.motion.bodies.finish(self.part, end)
         if scheme.turns_held and self.treatment is None:
-            contact.ties.damp_velocity(*fresh, state.v, found.time, self.part)
+            contact.ties.damp_velocity(*fresh, state.v, balance.time, self.part)
 
-    def _place_supports(self, end: float) -> None:
-        """Give supports that move their exact positions and rates."""
-        if self.prescribed.moving:
-            self.prescribed.place(end)
-            self.prescribed.take_rates(end)
-
-    def _treat(self, end: float) -> None:
-        """Apply the treatment of impact."""
-        if self.treatment is not None:
-            self.treatment.after()
-
-    def _account(self, end: float) -> None:
+    def _account(self) -> None:
         """Update the ledger."""
         self.iterations[0] += self.solution.newton
         self.iterations[1] += self.solution.linear
         if self.ledger is not None:
             self.ledger.update()
 
-    def _check(self, end: float) -> None:
-        """Find nodes that supports have carried through a rectangle."""
-        crossing = self.carried.of and self.carried.crossing(
-            self.state.position, end, self.at(self.state.step + 1, end)
-        )
-        if crossing:
-            self.fault = SimulationFailure(crossing)
-
     def load_of(self, balance: Balance) -> np.ndarray:
         """Return the external force (owned, 3) [N] of a balance that is not solved yet. Collective."""
         external = self.model.external
         if not external.active:
             return self.zero
-        if len(balance.loads) == 1 and balance.loads[0][0] == 1.0:
-            total = external.constant()
-            if total is not None:
-                return total
-        total = None
+        total = external.constant()
+        if total is not None:
+            return total
         for weight, time in balance.loads:
             if external.state_forces:
                 external.follow(*self._expected(balance, time))
             part = external.at(time, np.empty_like(self.state.v))
-            if weight != 1.0:
-                part *= weight
-            total = part if total is None else np.add(total, part, out=total)
+            part *= weight
+            total = part if total is None else total + part
         if external.failure is not None:
             self._fail_load(self.when(balance))
         return total

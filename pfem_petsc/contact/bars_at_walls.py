@@ -81,10 +81,13 @@ class BarContacts(NamedTuple):
 
 
 class BarMotion(NamedTuple):
-    """A ``step`` [s] of bars (m,) at a wall: their ends ``x`` (m, 2, 3) at its end, and ``before`` [m], and the
-    ``poses`` of walls then, and ``earlier`` ones."""
+    """A ``step`` [s] of bars (m,) at a wall: their ends ``x`` (m, 2, 3) at its end, and ``before`` [m], where they are
+    deepest at ``t`` (m,) and the distances ``gaps`` (m,) there [m], and the ``poses`` of walls then, and ``earlier``
+    ones."""
 
     x: np.ndarray
+    t: np.ndarray
+    gaps: np.ndarray
     before: np.ndarray
     poses: Poses
     earlier: Poses
@@ -173,7 +176,7 @@ class BarsAtWalls:
             keys = np.union1d(near, self._keys[self._keys // max(len(self._bars), 1) == i])
             bars = keys - i * len(self._bars)
             touched = np.isin(keys, self._keys)
-            gaps = contact.walls[k].deepest(poses.rest(k, x[bars_here[bars]]))[1]
+            t, gaps = contact.walls[k].deepest(poses.rest(k, x[bars_here[bars]]))
             found = (gaps < 0.0) | touched
             if not found.any():
                 continue
@@ -186,7 +189,13 @@ class BarsAtWalls:
                 stiffness = np.minimum(most, stiffness)
             ends = bars_here[bars]
             here = BarContacts(stiffness, self._inverse[bars], memory, touched)
-            yield k, keys, ends, here, BarMotion(x[ends], self._before[ends], poses, earlier, step)
+            yield (
+                k,
+                keys,
+                ends,
+                here,
+                BarMotion(x[ends], t[found], gaps[found], self._before[ends], poses, earlier, step),
+            )
 
     def add_forces(self, x: np.ndarray, f: np.ndarray, step: float, commit: bool) -> tuple[float, float]:
         """Add the forces at positions x (local, 3) [m], a ``step`` [s] after those that were committed last, to
@@ -231,7 +240,9 @@ class BarsAtWalls:
         for k, _, ends, here, motion in self._touching(x, step, self.time):
             m, size = len(ends), _NEXT_TO * np.linalg.norm(motion.x[:, 1] - motion.x[:, 0], axis=1)
             moves = np.concatenate([np.eye(6), -np.eye(6)]).reshape(12, 1, 2, 3) * size[:, None, None]
-            tried = motion._replace(x=(motion.x + moves).reshape(-1, 2, 3), before=np.tile(motion.before, (12, 1, 1)))
+            x = (motion.x + moves).reshape(-1, 2, 3)
+            t, gaps = self._contact.walls[k].deepest(motion.poses.rest(k, x))
+            tried = motion._replace(x=x, t=t, gaps=gaps, before=np.tile(motion.before, (12, 1, 1)))
             copies = BarContacts(*(np.tile(array, (12, *(array.ndim - 1) * [1])) for array in here))
             forces = self._respond(k, copies, tried).force.reshape(2, 6, m, 6)
             slopes = (forces[1] - forces[0]) / (2.0 * size[:, None])
@@ -289,11 +300,9 @@ class BarsAtWalls:
     def _respond(self, k: int, here: BarContacts, motion: BarMotion) -> Response:
         """Return what wall k does to bars."""
         wall, friction = self._contact.walls[k], self._contact.friction[self._contact.first[k]]
-        rest = motion.poses.rest(k, motion.x)
-        t, gaps, normals = _place(wall, rest)
-        touch = gaps < 0.0
-        t = np.where(touch, t, here.memory[:, PLACE])
-        normals = motion.poses.turned(k, normals)
+        gaps, touch = motion.gaps, motion.gaps < 0.0
+        t = np.where(touch, motion.t, here.memory[:, PLACE])
+        normals = motion.poses.turned(k, _normals(wall, motion.poses.rest(k, motion.x), t))
         weights = np.stack([1.0 - t, t], axis=1)
         point, start = (np.einsum("me,mei->mi", weights, ends) for ends in (motion.x, motion.before))
         slip = point - start - motion.earlier.ways(motion.poses, start)[:, k]
@@ -346,17 +355,16 @@ class BarsAtWalls:
         return np.where(push > 0.0 if not implicit else here.touched & (push > 0.0), np.maximum(total, 0.0), push)
 
 
-def _place(wall: BaseWall, ends: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return where bars with ends (m, 2, 3) are deepest beyond a wall at rest, and the distances there, see
-    :meth:`~pfem_petsc.contact.walls.base.BaseWall.deepest`, and the derivatives (m, 3) of these by the positions of the
-    places."""
-    (t, gaps), along = wall.deepest(ends), ends[:, 1] - ends[:, 0]
+def _normals(wall: BaseWall, ends: np.ndarray, t: np.ndarray) -> np.ndarray:
+    """Return the derivatives (m, 3) of the least distances of bars with ends (m, 2, 3) from a wall at rest by the
+    positions of the places ``t`` (m,)."""
+    along = ends[:, 1] - ends[:, 0]
     behind, ahead = (wall.planes(ends[:, 0] + (t + side * _BESIDE)[:, None] * along)[0] for side in (-1.0, 1.0))
     falls, rises = (np.einsum("mi,mi->m", normal, along) for normal in (behind, ahead))
     share = np.where(rises > falls, np.clip(rises / np.where(rises > falls, rises - falls, 1.0), 0.0, 1.0), 0.5)
     mean = share[:, None] * behind + (1.0 - share)[:, None] * ahead
     square = np.maximum(np.einsum("mi,mi->m", along, along), 1e-300)
-    return t, gaps, mean - (np.einsum("mi,mi->m", mean, along) / square)[:, None] * along
+    return mean - (np.einsum("mi,mi->m", mean, along) / square)[:, None] * along
 
 
 class Piercing:

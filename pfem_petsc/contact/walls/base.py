@@ -34,8 +34,10 @@ _DEEP = 0.125
 """Depth of bars in a body, as a fraction of its width, beyond which they are reported."""
 _SAMPLES = 9
 """Places along a bar at which the least distance is looked for first."""
-_BISECTIONS = 45
-"""Of what is left between two of them, to rounding."""
+_ROUNDS = 16
+"""Most steps from there to where it is; the last one, an odd one from zero, finds edges."""
+_SAME = 1e-15
+"""Part of the length to which that is found, and slope of the distance that counts as none."""
 _AT_END = 1e-7
 """Part of the length next to an end of a bar, where walls stop the node."""
 
@@ -227,16 +229,36 @@ class BaseWall(ABC):
         """
         where, least, along = np.zeros(len(ends)), np.full(len(ends), np.inf), ends[:, 1] - ends[:, 0]
         # the distance changes along a bar by no more than the way
-        near = np.flatnonzero(self.gaps(ends.mean(axis=1)) <= 0.5 * np.linalg.norm(along, axis=1))
+        lengths = np.linalg.norm(along, axis=1)
+        near = np.flatnonzero(self.gaps(ends.mean(axis=1)) <= 0.5 * lengths)
         if not len(near):
             return where, least
-        start, along, places = ends[near, 0], along[near], np.linspace(0.0, 1.0, _SAMPLES)
+        start, along, lengths, places = ends[near, 0], along[near], lengths[near], np.linspace(0.0, 1.0, _SAMPLES)
         best = np.stack([self.gaps(start + t * along) for t in places]).argmin(axis=0)
+
+        def tangents(t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+            points = start + t[:, None] * along
+            normals, offsets = self.planes(points)
+            return np.einsum("mi,mi->m", normals, along), np.einsum("mi,mi->m", normals, points) - offsets
+
+        # where the distance begins to grow along the bar: where a line through the slopes at both sides has the root,
+        # which finds it on round walls, in turn with where tangents meet, which finds edges
         low, high = places[np.maximum(best - 1, 0)], places[np.minimum(best + 1, _SAMPLES - 1)]
-        for _ in range(_BISECTIONS):  # for where the distance begins to grow along the bar
-            t = 0.5 * (low + high)
-            falls = np.einsum("mi,mi->m", self.planes(start + t[:, None] * along)[0], along) < 0.0
-            low, high = np.where(falls, t, low), np.where(falls, high, t)
+        (falling, before), (rising, after) = tangents(low), tangents(high)
+        last = low
+        for k in range(_ROUNDS):
+            between = np.maximum(rising - falling, 1e-300)
+            t = (low * rising - high * falling) / between
+            if k % 2:
+                t = (before - after + high * rising - low * falling) / between
+            t = np.clip(t, low, high)
+            slope, gap = tangents(t)
+            falls = slope < 0.0
+            low, falling, before = (np.where(falls, *pair) for pair in ((t, low), (slope, falling), (gap, before)))
+            high, rising, after = (np.where(falls, *pair) for pair in ((high, t), (rising, slope), (after, gap)))
+            if ((np.abs(t - last) < _SAME) | (high - low < _SAME) | (np.abs(slope) < _SAME * lengths)).all():
+                break
+            last = t
         between, gaps = (t > _AT_END) & (t < 1.0 - _AT_END), self.gaps(start + t[:, None] * along)
         where[near], least[near] = t, np.where(between, gaps, np.inf)
         return where, least

@@ -291,11 +291,14 @@ class BarsAtWalls:
         keys = (table[:, 0].astype(np.int64) * n + place)[here]
         ascending = np.argsort(keys)
         self._keys, self._memory = keys[ascending], table[here][ascending, 2:]
-        self.sums[:], self.force[:] = 0.0, 0.0
+        self.sums[:], total = 0.0, np.zeros((mesh.n_local, 3))
+        walls, bars = np.divmod(self._keys, max(n, 1))
         for i, k in enumerate(self.walls):
-            mine = self._keys[self._keys // max(n, 1) == i] - i * n
-            rows = self._memory[self._keys // max(n, 1) == i][self._counted[mine]]
+            rows = self._memory[(walls == i) & self._counted[bars]]
             self.sums[:, k] = rows[:, FORCE : MOMENT + 3].sum(axis=0).reshape(2, 3)
+        for end, part in enumerate((1.0 - self._memory[:, PLACE], self._memory[:, PLACE])):
+            np.add.at(total, mesh.bars[self._bars[bars], end], part[:, None] * self._memory[:, FORCE : FORCE + 3])
+        self.force = total[: mesh.n_owned]
 
     def _respond(self, k: int, here: BarContacts, motion: BarMotion) -> Response:
         """Return what wall k does to bars."""

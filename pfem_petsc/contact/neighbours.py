@@ -498,7 +498,7 @@ def _compare_rows(pieces, points, held, grid, folded, most):
     rows, at, gap = np.empty((_ROOM, 2), np.int32), np.empty((_ROOM, 2)), np.inf
     width, found, comparisons = folded[2], 0, 0.0
     begins = pieces.starts[::width]
-    near = _make_near(10 * np.diff(begins).max(), width)  # five rows, and their first and last cells twice
+    near = _make_near(10 * (begins[1:] - begins[:-1]).max(), width)  # five rows, and their first and last cells twice
     for row in range(folded[0] * folded[1]):
         if begins[row] == begins[row + 1]:
             continue

@@ -149,43 +149,6 @@ _SMALL_VOLUME = 1e-3  # of rows: two planes can bound the same node from an angl
 _DESCENTS = 30  # descent steps from a guess at which Newton's method cycled
 
 
-@dataclass(frozen=True)
-class Trial:
-    """The coordinates of one solve.
-
-    Attributes
-    ----------
-    candidates : nodes near walls, and carriers of rows; frames : their frames
-    transform : built from these, and from the rows that may close
-    tied : of tied nodes, indices among the frames (k,), walls (k,) and positions (k, 3) [m]
-    """
-
-    candidates: Candidates
-    frames: NodalFrames
-    tied: tuple[np.ndarray, np.ndarray, np.ndarray]
-    transform: Transform
-
-
-@dataclass(frozen=True)
-class Outcome:
-    """Result of the check of a solution.
-
-    Attributes
-    ----------
-    settled : whether all rows are satisfied
-    candidates, rows : for the next solve
-    trial : the trial that was solved
-    normal_forces : (m, slots) on the candidates of the trial [N]; pull : (m, 3) force that walls must balance there [N]
-    """
-
-    settled: bool
-    candidates: Candidates
-    rows: RowCoordinates | None
-    trial: Trial
-    normal_forces: np.ndarray
-    pull: np.ndarray
-
-
 class ActiveSet:
     """Contact in one implicit step. Construction is collective.
 
@@ -200,7 +163,9 @@ class ActiveSet:
 
     Attributes
     ----------
-    candidates, rows : of the first solve; no rows if none may close
+    candidates : of the next solve, and carriers of rows after :meth:`place`
+    rows : coordinates of rows that may close in the next solve; None if none may
+    frames, transform : of the candidates, and of these and the rows, in the last solve
     """
 
     def __init__(
@@ -223,56 +188,56 @@ class ActiveSet:
         self._all_rows = rows
         self.rows = rows if rows is not None and rows.reached(state, move, slack) else None
 
-    def place(self, candidates: Candidates, coupled: RowCoordinates | None, x: np.ndarray) -> Trial:
-        """Build the coordinates of candidates and rows at positions (owned, 3). Collective.
+    def place(self, x: np.ndarray) -> None:
+        """Build the coordinates of a solve, of candidates and rows at positions (owned, 3). Collective.
 
         Raises
         ------
         SimulationFailure
             On all ranks, if the walls and supports of a node are infeasible together.
         """
-        contact, slots = self.contact, self.friction.slots
-        relative = None if coupled is None else coupled.relative
+        contact, slots, candidates = self.contact, self.friction.slots, self.candidates
+        relative = None if self.rows is None else self.rows.relative
         if relative is not None:
             stopped = np.zeros(len(x), dtype=bool)
             stopped[candidates.nodes] = candidates.applicable.any(axis=1)
             relative.choose(stopped, x)
             self.friction.relate(relative)
-            candidates = candidates.beside(relative.nodes)
-        frames, tied = NodalFrames(candidates.nodes, slots), contact.ties.nobody
+            self.candidates = candidates = candidates.beside(relative.nodes)
+        self.frames, self._tied = NodalFrames(candidates.nodes, slots), contact.ties.nobody
         if candidates.anywhere:
             least = MIN_VOLUME if self._iterations < _PATIENCE else _SMALL_VOLUME
             tied_ones = contact.ties.held[candidates.nodes]
             untied = replace(candidates, applicable=candidates.applicable & ~tied_ones[:, None])
-            frames = contact.frames(untied, x, self.balance, slots, relative, least)
-            tied = contact.ties.pin(frames, x, self.balance.time)
-            self.friction.apply(frames)
-        met = frames if candidates.anywhere else None
-        if coupled is not None:
-            coupled.place(met, self.balance, self.state, x)
-        return Trial(candidates, frames, tied, Transform(self.model.mesh, met, coupled))
+            self.frames = contact.frames(untied, x, self.balance, slots, relative, least)
+            self._tied = contact.ties.pin(self.frames, x, self.balance.time)
+            self.friction.apply(self.frames)
+        met = self.frames if candidates.anywhere else None
+        if self.rows is not None:
+            self.rows.place(met, self.balance, self.state, x)
+        self.transform = Transform(self.model.mesh, met, self.rows)
 
-    def feasible(self, trial: Trial, u: np.ndarray, stiffness: np.ndarray | None = None) -> np.ndarray:
+    def feasible(self, u: np.ndarray, stiffness: np.ndarray | None = None) -> np.ndarray:
         """Return the increment (owned, 3) nearest to a guess that satisfies the frames' planes and rows. Collective.
 
         ``stiffness`` (owned,): weights of the nodes of rows in the distance [N/m]; default: their masses.
         """
-        u, frames, fixed = u.copy(), trial.frames, self.contact.fixed
+        u, frames, fixed = u.copy(), self.frames, self.contact.fixed
         stiffness = self.model.inertia.mass if stiffness is None else stiffness
-        if trial.transform.rows is not None:
-            trial.transform.rows.feasible(self.balance.predictor, u, stiffness)
+        if self.transform.rows is not None:
+            self.transform.rows.feasible(self.balance.predictor, u, stiffness)
         at, walls = frames.nodes, len(self.contact.wall_of)
         x = self.balance.predictor[at] + u[at]
         normals, offsets = (np.ascontiguousarray(array[:, :walls]) for array in (frames.normals, frames.offsets))
         moved, multipliers = x.copy(), np.zeros(offsets.shape)
         project(moved, fixed[at], normals, offsets, PROJECTED * self.model.size, multipliers)
         u[at] += moved - x
-        tied, _, places = trial.tied
+        tied, _, places = self._tied
         nodes = at[tied]
         u[nodes] = np.where(fixed[nodes], u[nodes], places - self.balance.predictor[nodes])
         return u
 
-    def approach(self, trial: Trial, problem: StepProblem, u: np.ndarray) -> np.ndarray:
+    def approach(self, problem: StepProblem, u: np.ndarray) -> np.ndarray:
         """Return a guess (owned, 3) with a better active set, by projected steepest descent. Collective.
 
         In oblique coordinates the active sets of Newton's method can cycle; projections onto the planes cannot.
@@ -280,42 +245,42 @@ class ActiveSet:
         model = self.model
         stiffness = problem.nodal + 2.0 * self.balance.weight * model.nodal_stiffness
         g = np.empty_like(u)
-        u = self.feasible(trial, u, stiffness)
+        u = self.feasible(u, stiffness)
         for _ in range(_DESCENTS):
             problem.imbalance(u, g)
             model.supports.clear(g)
-            u = self.feasible(trial, u - g / stiffness[:, None], stiffness)
+            u = self.feasible(u - g / stiffness[:, None], stiffness)
         return u
 
-    def relax(self, trial: Trial) -> bool:
+    def relax(self) -> bool:
         """Fix the directions of slip in the next solve; return whether the last solve solved for them. Collective."""
-        return trial.candidates.anywhere and self.friction.relax()
+        return self.candidates.anywhere and self.friction.relax()
 
-    def bounds(self, trial: Trial, guess: np.ndarray, w: np.ndarray) -> Bounds:
+    def bounds(self, guess: np.ndarray, w: np.ndarray) -> Bounds:
         """Return bounds on w (owned, 3): those of the frames and of rows. Collective.
 
         ``guess``, ``w`` (owned, 3): a guess of u with the prescribed components at their new values, and its w.
         """
-        if not trial.transform.bounded:
+        if not self.transform.bounded:
             return Bounds()
-        frames, at, x = trial.frames, trial.frames.nodes, self.balance.predictor + guess
+        frames, at, x = self.frames, self.frames.nodes, self.balance.predictor + guess
         lower, upper = np.full(w.shape, -np.inf), np.full(w.shape, np.inf)
-        base, rows = np.einsum("nij,nj->ni", frames.basis, self.balance.predictor[at]), trial.transform.rows
+        base, rows = np.einsum("nij,nj->ni", frames.basis, self.balance.predictor[at]), self.transform.rows
         if rows is not None:  # where prescribed motions move bounds instead of other unknowns
-            base = np.einsum("nij,nj->ni", frames.basis, trial.transform.positions(x)[at]) - w[at]
+            base = np.einsum("nij,nj->ni", frames.basis, self.transform.positions(x)[at]) - w[at]
         lower[at], upper[at] = frames.lower - base, frames.upper - base
         if rows is not None:
             rows.bound(x, w, lower)
         return Bounds((lower, upper))
 
     def check(
-        self, trial: Trial, bounds: Bounds, w: np.ndarray, u: np.ndarray, g: np.ndarray, noise: float, tolerance: float
-    ) -> Outcome:
-        """Check whether the solution satisfies all walls and rows, and prepare the next solve if not. Collective.
+        self, bounds: Bounds, w: np.ndarray, u: np.ndarray, g: np.ndarray, noise: float, tolerance: float
+    ) -> bool:
+        """Return whether the solution satisfies all walls and rows, and prepare the next solve if not. Collective.
 
         Parameters
         ----------
-        w, u : (owned, 3) solution in the trial's coordinates and in x [m]
+        w, u : (owned, 3) solution in the coordinates of the solve and in x [m]
         g : (owned, 3) residual force at the solution [N]
         noise : residual force left at a free node [N]
         tolerance : residual force allowed at a free node [N]
@@ -325,22 +290,22 @@ class ActiveSet:
         NotConverged
             On all ranks, if the number of solves exceeds its limit.
         """
-        contact, frames, candidates = self.contact, trial.frames, trial.candidates
-        x, at, walls = self.balance.predictor + u, trial.candidates.nodes, len(contact.wall_of)
-        slack, relative = ON_BOUND * self.model.size, trial.transform.relative
-        settled, rows, g = self._check_rows(trial, bounds, w, x, g, noise, slack)
+        contact, frames, candidates = self.contact, self.frames, self.candidates
+        x, at, walls = self.balance.predictor + u, candidates.nodes, len(contact.wall_of)
+        slack, relative = ON_BOUND * self.model.size, self.transform.relative
+        settled, g = self._check_rows(bounds, w, x, g, noise, slack)
         if relative is not None:
             g = relative.forces(g)
-        normal_forces, pull = np.zeros(frames.rows.shape), np.where(contact.fixed[at], 0.0, g[at])
+        normal_forces, self._pull = np.zeros(frames.rows.shape), np.where(contact.fixed[at], 0.0, g[at])
         if not contact.any and not candidates.anywhere:
-            return Outcome(settled, candidates, rows, trial, normal_forces, pull)
+            return settled
         if candidates.anywhere:
             turned = np.einsum("nji,nj->ni", frames.inverse, g[at])
             normal_forces = contact.strengths(frames, turned, bounds.active(at, w, turned, noise))
         joined, broken = broken_walls(contact, self._poses, candidates, frames, x, slack)
         if candidates.anywhere:
-            y = trial.transform.positions(x)[at]
-            normal_forces = self.friction.check(frames, y, pull, normal_forces, noise, tolerance)
+            y = self.transform.positions(x)[at]
+            normal_forces = self.friction.check(frames, y, self._pull, normal_forces, noise, tolerance)
         left = np.union1d(joined, self.friction.unsettled)
         unsettled = is_misaligned(frames, contact.fixed[at], normal_forces)
         by_walls, part = normal_forces[:, :walls], self.balance.acting
@@ -350,9 +315,10 @@ class ActiveSet:
             if self._iterations >= _ITERATIONS:
                 raise NotConverged(self._why(left, x))
             rank = PROJECTED * self.model.size
-            candidates = candidates.join(contact, self._poses, joined, broken, x, by_walls, rank)
+            self.candidates = candidates.join(contact, self._poses, joined, broken, x, by_walls, rank)
             settled = False
-        return Outcome(settled, candidates, rows, trial, normal_forces, pull)
+        self._normal_forces = normal_forces
+        return settled
 
     def _why(self, left: np.ndarray, x: np.ndarray) -> str:
         """Return why the solves of nodes (k,) at (owned, 3) do not converge, and the remedy. Collective."""
@@ -368,48 +334,49 @@ class ActiveSet:
         )
 
     def _check_rows(
-        self, trial: Trial, bounds: Bounds, w: np.ndarray, x: np.ndarray, g: np.ndarray, noise: float, slack: float
-    ) -> tuple[bool, RowCoordinates | None, np.ndarray]:
-        """Return whether rows over several nodes are satisfied at positions (owned, 3), those of the next solve, and
-        part of the residual force that walls must balance. Collective."""
-        rows = trial.transform.rows
+        self, bounds: Bounds, w: np.ndarray, x: np.ndarray, g: np.ndarray, noise: float, slack: float
+    ) -> tuple[bool, np.ndarray]:
+        """Return whether rows over several nodes are satisfied at positions (owned, 3), and the part of the residual
+        force that walls must balance. Collective."""
+        rows = self.rows
         if rows is None:
-            broken = self._all_rows is not None and self._all_rows.broken(x, slack)
-            return not broken, self._all_rows if broken else None, g
+            if self._all_rows is not None and self._all_rows.broken(x, slack):
+                self.rows = self._all_rows
+            return self.rows is None, g
         own, g = g.copy(), g.copy()
-        trial.transform.adjoint(own)
+        self.transform.adjoint(own)
         rows.solve_forces(w, own, bounds.arrays[0], noise)
         rows.constraints.add_forces(g, -1.0)
         satisfied = rows.satisfied(x, slack)
         self._row_iterations += not satisfied
         if self._row_iterations >= _ITERATIONS:
             raise NotConverged(f"constraints and positions did not agree in {_ITERATIONS} solves; {self._remedy}")
-        return satisfied, rows, g
+        return satisfied, g
 
-    def forces(self, outcome: Outcome, u: np.ndarray) -> tuple[np.ndarray, WallForces, np.ndarray]:
+    def forces(self, u: np.ndarray) -> tuple[np.ndarray, WallForces, np.ndarray]:
         """Return contact forces (owned, 3) [N], sums per wall, and the owned nodes in contact, at the solution."""
         total, x = np.zeros_like(u), self.balance.predictor + u
-        frames, walls, relative = outcome.trial.frames, len(self.contact.wall_of), outcome.trial.transform.relative
+        frames, walls, relative = self.frames, len(self.contact.wall_of), self.transform.relative
         at, dissipated = frames.nodes, np.zeros(self.friction.slots)
-        if outcome.trial.candidates.anywhere:
-            dissipated = self.friction.dissipated(at, outcome.trial.transform.positions(x)[at])
+        if self.candidates.anywhere:
+            dissipated = self.friction.dissipated(at, self.transform.positions(x)[at])
         if self._all_rows is not None:
             constraints = self._all_rows.constraints
-            if outcome.rows is None:
+            if self.rows is None:
                 constraints.release()
             elif relative is not None:
-                outcome.rows.set_forces(at, outcome.normal_forces[:, walls:], self.friction.drag[:, walls:])
+                self.rows.set_forces(at, self._normal_forces[:, walls:], self.friction.drag[:, walls:])
             constraints.friction = float(dissipated[walls:].sum())
             constraints.add_forces(total)
         held = np.zeros(len(u), dtype=bool)
-        if not outcome.trial.candidates.anywhere:
+        if not self.candidates.anywhere:
             return total, self.contact.nothing, held
         x = x[at]
-        force = outcome.normal_forces[:, :walls, None] * frames.normals[:, :walls] + self.friction.drag[:, :walls]
-        touching, friction = outcome.normal_forces[:, :walls] > 0.0, float(dissipated[:walls].sum())
-        tied, owners, _ = outcome.trial.tied
+        force = self._normal_forces[:, :walls, None] * frames.normals[:, :walls] + self.friction.drag[:, :walls]
+        touching, friction = self._normal_forces[:, :walls] > 0.0, float(dissipated[:walls].sum())
+        tied, owners, _ = self._tied
         owners = self.contact.first[owners]
-        force[tied, owners] = outcome.pull[tied]
+        force[tied, owners] = self._pull[tied]
         touching[tied, owners] = True
         total[at] += force.sum(axis=1)
         held[at] = touching.any(axis=1)

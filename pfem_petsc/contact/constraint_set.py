@@ -69,19 +69,19 @@ class _WallsAtRows:
     Attributes
     ----------
     any : whether there are any on this rank; everywhere : on any rank
-    flags : how many flags of walls travel with the positions of nodes
+    members : (n, w) bool, walls that can stop each node; partial : whether nodes can pass beside any that meets rows
     nodes : (m,) nodes of the rows that walls can stop
     rubs, curved, ties : whether any wall of the model that meets rows has friction, is curved, is tied
     """
 
     def __init__(self, rows: RowSet, contact: Contact) -> None:
-        self._rows, self._contact, comm = rows, contact, rows.mesh.comm
-        self._members = rows.gather(contact.members) > 0.0
-        met = self._members.any(axis=1)
+        self._contact, comm = contact, rows.mesh.comm
+        self.members = rows.gather(contact.members) > 0.0
+        met = self.members.any(axis=1)
         self.nodes, self.any = np.flatnonzero(met), bool(met.any())
-        meets = comm.allreduce(self._members.sum(axis=0)) > 0
+        meets = comm.allreduce(self.members.sum(axis=0)) > 0
         self.everywhere, self.meets = bool(meets.any()), meets
-        self.flags = len(contact.wall_of) if self.everywhere and contact.partial else 0
+        self.partial = self.everywhere and contact.partial
         self.rubs = bool((contact.static_friction > 0.0)[meets].any())
         self.curved, self.ties = not contact.flat[meets].all(), bool(contact.ties.tying[meets].any())
         self._places = np.where(met, np.cumsum(met) - 1, -1)
@@ -102,16 +102,6 @@ class _WallsAtRows:
         """Return rebound and arrival of owned nodes (k,) at all walls, (k, 2 w)."""
         memory, none = self._contact.state.memory, np.zeros(self._contact.members.shape)
         return np.column_stack([memory.get(name, none)[at] for name in ("rebound", "arrival")])
-
-    def applies(self, x: np.ndarray, flags: np.ndarray, time: float) -> np.ndarray:
-        """Return (n, w) bool: walls that can stop nodes that move to x (n, 3); ``flags`` (k, flags): those that can
-        stop nodes of other ranks."""
-        applies, where = self._members.copy(), self._rows.where
-        if self.flags:
-            own, poses = where >= 0, self._contact.motion.poses(time)
-            applies[own] &= self._contact.applicable(where[own], x[own], poses)
-            applies[~own] &= flags[-1 - where[~own]] > 0.0
-        return applies
 
     def stopping(
         self,
@@ -179,8 +169,7 @@ class ConstraintSet:
         tables = [*case.contact_pair, *case.constraint]
         self.names = [table.name for table in tables]
         self.n_pairs = len(case.contact_pair)
-        kinds = ["pair"] * self.n_pairs + ["constraint"] * len(case.constraint)
-        self.columns = [f"{kind}/{name}" for kind, name in zip(kinds, self.names, strict=True)]
+        self.columns = [f"{'pair' if k < self.n_pairs else 'constraint'}/{name}" for k, name in enumerate(self.names)]
         self._sources: list[Constraint] = [_find_pairs(case, k, nodes, self.mesh) for k in range(self.n_pairs)]
         self._sources += [_source(case.source, keys, nodes, self.mesh) for keys in case.constraint]
         self.dynamic = any(source.dynamic for source in self._sources)
@@ -289,20 +278,16 @@ class ConstraintSet:
         if not self:
             return None
         rows, x, walls = self.rows, self._x, self._walls
-        flags, far = slice(4, 4 + walls.flags), np.empty((0, 4 + walls.flags))
+        far = np.empty((0, 4))
         if not rows.partners.alone:
-            at, leaving = rows.partners.rows, rows.partners.leaving(far.shape[1])
+            at, leaving = rows.partners.rows, rows.partners.leaving(4)
             free_positions(at, balance.predictor, u, far, leaving)
             leaving[:, 3] = stiffness[at]
-            if walls.flags:
-                poses = self.contact.motion.poses(balance.time)
-                leaving[:, flags] = self.contact.applicable(at, leaving[:, :3], poses)
             far = rows.partners.bring(leaving)
         free_positions(rows.where, balance.predictor, u, far, x)
-        start, drift, held, memory = self._starts(balance, state)
+        start, drift, held, memory, applies = self._starts(balance, state, u)
         free, stopping = rows.free, None
         if walls.any:
-            applies = walls.applies(x, far[:, flags], balance.time)
             if walls.ties:
                 tied = held[:, :1] > 0.0
                 free, applies = np.where(tied, 0.0, free), applies & ~tied
@@ -311,7 +296,9 @@ class ConstraintSet:
         nodes = FreeNodes(x, rows.spread(stiffness, far[:, 3]), start, balance.acting < 1.0, free)
         moved = rows.along(rows.fixed_jacobian, x - start) if self.rebounds else np.empty(0)
         pull = rows.along(rows.fixed_jacobian, drift) - moved if self.rebounds else moved
-        lift, before = self._lift(pull), self.force > 0.0
+        lift, before = 0.0, self.force > 0.0
+        if self.rebounds and self.rebound.any():  # bounds of rows that rebound are above zero
+            lift = rebound_lift(rows.restitution, self.rebound, self.arrival, pull)
         force = np.zeros(len(before))
         try:
             pushes, self.gradients = rows.project(nodes, self.contact.tolerance, stopping, lift)
@@ -330,32 +317,29 @@ class ConstraintSet:
         load = rows.forces(self.gradients, self.force, self.drag)
         return load if load[rows.mine].any() else None
 
-    def _starts(self, balance: Balance, state: State) -> tuple[np.ndarray | None, ...]:
+    def _starts(self, balance: Balance, state: State, u: np.ndarray) -> tuple[np.ndarray | None, ...]:
         """Return positions at the start of a step and displacements without forces (n, 3) [m], tied nodes and where to
-        (n, 4), and the memory of walls (2, n, w); nothing of what no row or wall needs. Collective."""
-        walls = self._walls
+        (n, 4), the memory of walls (2, n, w), and walls that can stop nodes with increments ``u`` (owned, 3) without
+        rows, (n, w) bool; nothing of what no row or wall needs. Collective."""
+        walls, contact = self._walls, self.contact
         rebounds, at_start = self.rebounds or walls.rebounds, balance.acting < 1.0
         starts = rebounds or self.rows.rubs or walls.rubs or (at_start and (self._turning or walls.curved))
-        none, needed = np.empty((2, len(self._x), 0)), (starts, rebounds, walls.ties, walls.rebounds)
+        none, needed = np.empty((2, len(self._x), 0)), (starts, rebounds, walls.ties, walls.rebounds, walls.partial)
         if not any(needed):
-            return None, none[0], none[0], none
+            return None, none[0], none[0], none, walls.members
+        poses = contact.motion.poses(balance.time)
         parts = (
             lambda at: state.position[at],
             lambda at: balance.predictor[at] - state.position[at],
             lambda at: walls.held(at, balance.time),
             walls.memory,
+            lambda at: contact.applicable(at, balance.predictor[at] + u[at], poses),
         )
         table = self.rows.collect(lambda at: np.column_stack([part(at) for part in compress(parts, needed)]))
-        start, drift, held, memory = np.split(table, np.cumsum([3 * starts, 3 * rebounds, 4 * walls.ties]), axis=1)
+        widths = np.array([3, 3, 4, 2 * len(contact.wall_of)]) * needed[:4]
+        start, drift, held, memory, applies = np.split(table, np.cumsum(widths), axis=1)
         memory = np.stack(np.split(memory, 2, axis=1)) if walls.rebounds else none
-        return start if starts else None, drift, held, memory
-
-    def _lift(self, pull: np.ndarray) -> np.ndarray | float:
-        """Return by how much bounds of rows (r,) are above zero [m], with ``pull`` (r,) of forces [m], because they
-        rebound."""
-        if not self.rebounds or not self.rebound.any():
-            return 0.0
-        return rebound_lift(self.rows.restitution, self.rebound, self.arrival, pull)
+        return start if starts else None, drift, held, memory, applies > 0.0 if walls.partial else walls.members
 
     def push(self, load: np.ndarray, stiffness: np.ndarray, u: np.ndarray, contact: np.ndarray) -> None:
         """Correct increments by the forces of :meth:`explicit`, and add these to ``contact``, (owned, 3) both."""
@@ -663,24 +647,22 @@ def _find_pairs(case: Case, index: int, nodes: dict[str, np.ndarray], mesh: Dist
     points, order = np.concatenate(comm.allgather(mesh.points[first])), np.argsort(known)
     at = nearest_points(across(points[order], normal), across(mesh.points[second], normal))
     nearest = known[order[at]]
-    router = Router(comm, slab_of(nearest, mesh.n_nodes, comm.size))
-    met, own = router.send(nearest), router.send(numbers)
-    order = np.lexsort((own, met))
-    met, own = met[order], own[order]
-    first_twice = [(met[k], own[k], own[k + 1]) for k in np.flatnonzero(np.diff(met) == 0)[:1]]
-    twice = min((pair for pairs in comm.allgather(first_twice) for pair in pairs), default=None)
-    if twice is not None:
+    pairs = np.concatenate(comm.allgather(np.column_stack([nearest, numbers])))
+    pairs = pairs[np.lexsort(pairs.T[::-1])]
+    twice = np.flatnonzero(pairs[1:, 0] == pairs[:-1, 0])
+    if len(twice):
+        (met, one), (_, other) = pairs[twice[0]], pairs[twice[0] + 1]
         raise InputError(
-            f"{key}: two nodes of second are nearest to the same node of first, seen along the direction: {twice[1]} "
-            f"and {twice[2]} to {twice[0]}; correct direction, or give node sets whose nodes lie opposite each other"
+            f"{key}: two nodes of second are nearest to the same node of first, seen along the direction: {one} "
+            f"and {other} to {met}; correct direction, or give node sets whose nodes lie opposite each other"
         )
-    lowest = comm.allreduce(int(nearest[nearest == numbers].min(initial=mesh.n_nodes)), op=MPI.MIN)
-    if lowest < mesh.n_nodes:
+    itself = pairs[pairs[:, 0] == pairs[:, 1], 0]
+    if len(itself):
         raise InputError(
-            f"{key}: node {lowest} is paired with itself, as first {pair.first!r} and second {pair.second!r} both have "
-            "it; give node sets without common nodes"
+            f"{key}: node {itself[0]} is paired with itself, as first {pair.first!r} and second {pair.second!r} both "
+            "have it; give node sets without common nodes"
         )
-    return PairRows(pair, np.column_stack([nearest, numbers]))
+    return PairRows(pair, pairs[slab_of(pairs[:, 0], mesh.n_nodes, comm.size) == comm.rank])
 
 
 def across(points: np.ndarray, normal: np.ndarray) -> np.ndarray:

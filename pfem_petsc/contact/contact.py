@@ -31,9 +31,8 @@ class Contact(ExplicitContact):
     def special(self) -> np.ndarray:
         """(slots,) bool: of walls other than plain planes with prescribed displacements: curved, turning, with mass,
         friction or restitution, or tied."""
-        special = ~self.flat | (self.restitution > 0.0) | (self.static_friction > 0.0) | self.ties.tying
-        special |= np.isin(self.wall_of, self.motion.bodies.at)
-        return special
+        massive = np.isin(self.wall_of, self.motion.bodies.at)
+        return ~self.flat | (self.restitution > 0.0) | (self.static_friction > 0.0) | self.ties.tying | massive
 
     @property
     def steady(self) -> bool:
@@ -186,9 +185,8 @@ def expected_candidates(contact: Contact, state: State, balance: Balance, held: 
     starts = state.position[nodes], contact.motion.poses(state.time), BEYOND * contact.size
     for place, there, distance in ((x, poses, reach[nodes, None]), starts):
         within |= contact.distances(applicable, place, there)[1] < distance
-    for k in contact.surfaces_of_triangles:  # whose other faces are found when nodes touch them
-        slots = contact.slots(k)
-        within[:, slots] = within[:, slots].any(axis=1, keepdims=True)
+    # other faces of surfaces of triangles are found when nodes touch them
+    within = np.logical_or.reduceat(within, contact.first, axis=1)[:, contact.wall_of]
     return Candidates(nodes, within & applicable)
 
 

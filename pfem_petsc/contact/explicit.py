@@ -367,24 +367,25 @@ def press_nodes(given, walls, sums, curved, rough, several):
     return failed, why, found, total, touching, dissipated
 
 
-class Levers(NamedTuple):
-    """Walls with mass (f,): that of each slot, ``body`` (w,), -1 for none; and their ``pivots`` (2, f, 3), where the
-    forces of the balance act and at the end of the step [m]."""
-
-    body: np.ndarray
-    pivots: np.ndarray
-
-
 class Held(NamedTuple):
-    """Nodes (m,) that walls (w,) stop or that are tied to them: ``stiffness`` (m,) [N/m], components ``fixed`` by
-    supports (m, 3) and walls that they are ``touching`` (m, w) bool, positions ``acts`` (m, 3) where the forces of the
-    balance act, and ``places`` at the end of the step (m, 3) [m]."""
+    """Nodes (m,) that walls (w,) stop or that are tied to them, and walls with mass (f,).
+
+    Attributes
+    ----------
+    stiffness : (m,) [N/m]
+    fixed, touching : (m, 3), (m, w) bool, components that supports prescribe, and walls that they touch
+    acts, places : (m, 3) positions where the forces of the balance act, and at the end of the step [m]
+    body : (w,) the wall with mass of each slot, -1 for none
+    pivots : (2, f, 3) those of walls with mass, where the forces of the balance act and at the end of the step [m]
+    """
 
     stiffness: np.ndarray
     fixed: np.ndarray
     touching: np.ndarray
     acts: np.ndarray
     places: np.ndarray
+    body: np.ndarray
+    pivots: np.ndarray
 
 
 @inlined
@@ -413,14 +414,14 @@ def _slope_of_plane(j, k, weight, normal, given, held, walls):
 
 
 @kernel
-def slopes_of_walls(given, held, walls, levers):
+def slopes_of_walls(given, held, walls):
     """Return the derivatives (f, 6, 6) of forces of walls with mass on nodes, and of the moments of these about the
     pivots, by displacements and small rotations of the walls.
 
     ``given`` are those of the first of the :class:`Held` nodes; the others are tied.
     """
     normals = planes_of(held.places[: len(given.free)], given.free, given, walls)[0].normals
-    total, w = np.zeros((levers.pivots.shape[1], 6, 6)), held.touching.shape[1]
+    total, w = np.zeros((held.pivots.shape[1], 6, 6)), held.touching.shape[1]
     rows, whole = np.zeros((w, 3)), np.empty((3, 6))
     for j in range(len(held.places)):
         tied = j >= len(normals)
@@ -431,14 +432,14 @@ def slopes_of_walls(given, held, walls, levers):
             put(rows, k, free)
         inverse = np.linalg.pinv(rows, RANK)
         for k in range(w):
-            i = levers.body[k]
+            i = held.body[k]
             if not held.touching[j, k] or i < 0:
                 continue
             slope = np.diag(np.where(held.fixed[j], 0.0, held.stiffness[j]))
             if not tied:
                 weight = held.stiffness[j] * (inverse[:, k] ** 2).sum()  # of the diagonal of k (N N^T)^-1
                 slope = _slope_of_plane(j, k, weight, normals[j, k].copy(), given, held, walls)
-            arms = np.stack((held.acts[j] - levers.pivots[0, i], held.places[j] - levers.pivots[1, i]))
+            arms = np.stack((held.acts[j] - held.pivots[0, i], held.places[j] - held.pivots[1, i]))
             lever = across(arms)
             whole[:, :3], whole[:, 3:] = slope, -(slope @ lever[1])
             total[i, :3] += whole
@@ -636,10 +637,10 @@ class ExplicitContact(NodeWalls):
             return np.zeros((len(bodies.at), 6, 6))
         body = np.full(len(self.walls), -1)
         body[bodies.at] = np.arange(len(bodies.at))
-        levers = Levers(body[self.wall_of], np.stack([bodies.pivots(part) for part in (self._part, 1.0)]))
+        pivots = np.stack([bodies.pivots(part) for part in (self._part, 1.0)])
         start = places if self.state is None else self.state.position[nodes]
         acts = start + self._part * (places - start)
-        held = Held(stiffness[nodes], self.fixed[nodes], found.walls.touching, acts, places)
+        of_nodes = stiffness[nodes], self.fixed[nodes], found.walls.touching, acts, places
         walls, w = self.walls_at(self.motion.poses(time), self._part), len(self.wall_of)
         if given is None:  # all are tied
             some, vectors, planes = np.empty((0, w)), np.empty((0, 3)), np.empty((0, w, 3))
@@ -647,7 +648,7 @@ class ExplicitContact(NodeWalls):
             given = Arrivals(
                 vectors, vectors, planes, vectors, some[:, 0], *flags, some[:, :0], some[:, :0], planes, some
             )
-        return slopes_of_walls(given, held, walls, levers)
+        return slopes_of_walls(given, Held(*of_nodes, body[self.wall_of], pivots), walls)
 
     def _set_rebounds(self, given: Arrivals, normals: np.ndarray, unpushed: np.ndarray) -> None:
         """Set the memory of nodes that hit walls with inertia, at planes with normals (m, slots, 3); ``unpushed``

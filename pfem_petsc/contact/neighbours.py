@@ -28,7 +28,7 @@ _BLOCK = 8  # cells along the edges of blocks, of which each belongs to one rank
 _BLOCKS = 1 << 14  # different blocks; those with the same hash belong to the same rank
 
 _CELLS = (1 << 21) - 2  # along an axis; those beyond belong to the last one
-_ROOM = 1 << 12  # pairs, and pieces near a cell, for which there is room at first
+_ROOM = 1 << 12  # pairs for which there is room at first
 _LANES = 32  # boxes compared at once, at most
 # In single precision and cells: rounding, a half, and a product of lengths below which squares vanish.
 _SLACK, _HALF, _TINY = np.float32(1e-3), np.float32(0.5), np.float32(1e-15)
@@ -496,19 +496,16 @@ def _compare_rows(pieces, points, held, grid, folded, most):
     """Return the rows of segments that are pairs (m, 2), where they are closest (m, 2), the gap, see :class:`Pairs`,
     and the number of comparisons, which end beyond the most."""
     rows, at, gap = np.empty((_ROOM, 2), np.int32), np.empty((_ROOM, 2)), np.inf
-    near, found, comparisons = _make_near(_ROOM + _LANES, folded[2]), 0, 0.0
-    width = folded[2]
+    width, found, comparisons = folded[2], 0, 0.0
+    begins = pieces.starts[::width]
+    near = _make_near(10 * (begins[1:] - begins[:-1]).max(), width)  # five rows, and their first and last cells twice
     for row in range(folded[0] * folded[1]):
-        if pieces.starts[row * width] == pieces.starts[(row + 1) * width]:
+        if begins[row] == begins[row + 1]:
             continue
-        room, i, j = 0, row // folded[1], row % folded[1]
+        i, j = row // folded[1], row % folded[1]
         for step in range(5):
             x, y = (i + (step > 1)) % folded[0], (j + (step if step < 2 else step - 3)) % folded[1]
             near.lines[step] = (x * folded[1] + y) * width
-            room += 2 * (pieces.starts[near.lines[step] + width] - pieces.starts[near.lines[step]])
-        if room > len(near.places):
-            near, lines = _make_near(2 * room, width), near.lines
-            near.lines[:] = lines
         _gather(pieces, width, near)
         for k in range(width):
             begin, end = near.bounds[k, 1], near.bounds[k + 3, 0]

@@ -295,10 +295,8 @@ class NodeWalls:
         """
         members = self.members if nodes is None else self.members[nodes]
         poses = self.motion.poses(time)
-        gaps = np.empty((len(x), len(self.walls)))
-        for k, s in enumerate(self.first):
-            gaps[:, k] = np.where(members[:, s], self.gap(k, x, poses), np.inf)
-        return gaps
+        gaps = [self.gap(k, x, poses) for k in range(len(self.walls))]
+        return np.where(members[:, self.first], np.transpose(gaps), np.inf)
 
     def gap(self, k: int, x: np.ndarray, poses: Poses) -> np.ndarray:
         """Return distances (m,) [m] of positions (m, 3) from wall k."""
@@ -406,9 +404,7 @@ class NodeWalls:
         for k, wall in enumerate(self.walls):
             s, rest, slots = self.first[k], poses.rest(k, x), self.slots(k)
             if self.flat[s]:
-                normals[:, s], offsets[:, s] = wall.planes(rest)
-                normals[:, s] = poses.turned(k, normals[:, s])
-                offsets[:, s] += normals[:, s] @ poses.shifts[k]
+                normals[:, s], offsets[:, s] = wall.normal, wall.offset + wall.normal @ poses.shifts[k]
                 continue
             if k in self._faces:
                 own, distances = self._faces[k].planes(nodes, rest)

@@ -309,23 +309,23 @@ class ImplicitStepper(Stepper):
         if self.rows is not None and self.rows.rows is not model.links.rows:
             self._couple_rows()
         active_set = ActiveSet(model, self.state, balance, self.held, self.rows, self.remedy)
-        candidates, rows = self._candidates(active_set, balance), active_set.rows
+        active_set.candidates = self._candidates(active_set, balance)
         newton = linear = 0
         near_bound = 2.0 * zero_tolerance(model.size)
         while True:
             try:
-                trial = active_set.place(candidates, rows, balance.predictor + guess)
+                active_set.place(balance.predictor + guess)
             except SimulationFailure as failure:
                 raise SimulationFailure(f"{self.when(balance)}: {failure}") from failure
-            problem = StepProblem(model, state, balance, state.external, trial.transform)
-            near = active_set.feasible(trial, guess)
+            problem = StepProblem(model, state, balance, state.external, active_set.transform)
+            near = active_set.feasible(guess)
             w = problem.coordinates(near)
-            bounds = active_set.bounds(trial, near, w)
+            bounds = active_set.bounds(near, w)
             w = bounds.clip(w, near_bound)
             report = self.newton.solve(problem, w, ends, bounds.arrays)
-            relaxed = not report.converged and active_set.relax(trial)
-            if not report.converged and not relaxed and not trial.transform.identity:
-                w = problem.coordinates(active_set.approach(trial, problem, guess))
+            relaxed = not report.converged and active_set.relax()
+            if not report.converged and not relaxed and not active_set.transform.identity:
+                w = problem.coordinates(active_set.approach(problem, guess))
                 w = bounds.clip(w, near_bound)
                 report = report.then(self.newton.solve(problem, w, ends, bounds.arrays))
             newton += report.newton
@@ -344,15 +344,15 @@ class ImplicitStepper(Stepper):
             g = np.empty_like(u)
             problem.imbalance(u, g, evaluated=True)
             try:
-                outcome = active_set.check(trial, bounds, w, u, g, report.norm, tolerance)
+                settled = active_set.check(bounds, w, u, g, report.norm, tolerance)
             except NotConverged as failure:
                 raise NotConverged(f"{self.when(balance)}: {failure}") from failure
-            if outcome.settled:
+            if settled:
                 break
-            candidates, rows, guess = outcome.candidates, outcome.rows, u
-        if not trial.candidates.anywhere and not model.supports.any and model.bars.springs is None:
+            guess = u
+        if not active_set.candidates.anywhere and not model.supports.any and model.bars.springs is None:
             self._keep_momentum(problem, u, g)
-        state.contact, walls, self.held = active_set.forces(outcome, u)
+        state.contact, walls, self.held = active_set.forces(u)
         held = model.links.count_held(np.flatnonzero(self.held))
         state.support = model.supports.part(g - state.contact)
         internal = problem.f if balance.weight else state.f

@@ -278,10 +278,9 @@ class Restitution(Treatment):
     def put(self, nodes: np.ndarray, v: np.ndarray, a: np.ndarray) -> None:
         """Set velocities and accelerations (m, 3) of nodes (m,) in contact and of those just released."""
         gone, left, slower = self._let_go()
-        walls = self.stepper.touching[nodes]
-        if len(gone):
-            nodes, v, a = np.append(nodes, gone), np.vstack([v, slower]), np.vstack([a, self.stepper.state.a[gone]])
-            walls = np.vstack([walls, left[:, None] == np.arange(walls.shape[1])])
+        touching = self.stepper.touching
+        walls = np.vstack([touching[nodes], left[:, None] == np.arange(touching.shape[1])])
+        nodes, v, a = np.append(nodes, gone), np.vstack([v, slower]), np.vstack([a, self.stepper.state.a[gone]])
         if len(nodes):
             self.set(nodes, v, a, walls)
 

@@ -466,7 +466,6 @@ class ExplicitContact(NodeWalls):
     Attributes
     ----------
     ties : Ties
-    plain : infinite flat walls, spheres and cylinders without ties: compiled passes handle them alone
     room : (owned,) int64, where compiled passes list the nodes beyond the former; (0,) without walls
     known : (slots,) bool, planes, spheres and cylinders that do not turn, which compiled passes know
     called : (walls,) bool, other walls and those with mass
@@ -487,7 +486,6 @@ class ExplicitContact(NodeWalls):
         self.ties = Ties(self, case.wall if parameters is None else parameters)
         self._unmoved = np.zeros((len(self.wall_of), 3))
         self.pushes = np.zeros((2, len(self.walls), 3))  # known forces of walls on bars, and their moments
-        self.plain = bool((self.surfaces.radii != OTHER).all()) and not (self.partial or self.ties.any)
         massive = [wall.mass is not None for wall in (case.wall if parameters is None else parameters)]
         self.called = (self.surfaces.radii[self.first] == OTHER) | np.array(massive, dtype=bool)
         self.tolerance, self.known = PROJECTED * self.size, self.surfaces.radii != OTHER

@@ -262,10 +262,6 @@ class Removals:
         self._replace(entry, now)
         self.gone.append(entry.supports)
 
-    def finish(self, entry: Remove) -> None:
-        """End the load that a support has left."""
-        self._model.external.reactions.pop(entry.supports, None)
-
     def resume(self, now: float) -> None:
         """Continue after times and reactions were restored."""
         for k, entry in enumerate(self._entries):

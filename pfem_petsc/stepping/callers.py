@@ -62,12 +62,13 @@ class Caller:
 
     def begin(self, step: int) -> None:
         """Prepare calls in steps from one of a number on."""
-        self._begin, self._error, self.failure = step, None, None
+        self._begin, self.failure = step, None
 
     def end(self) -> None:
         """Raise what went wrong in a call, except :attr:`failure`."""
-        if self._error is not None:
-            raise self._error
+        error, self._error = self._error, None
+        if error is not None:
+            raise error
 
     def _call(self, step: int, what: int) -> int:
         if self._error is not None:

@@ -407,9 +407,9 @@ def record_row(s, step):
     ends = sums.ends
     energies[_SPRINGS] = sums.springs[3]
     energies[_TOUCHING], energies[_TOUCHED] = s.touching[0], s.touching[1]
-    row[_PAIRS], row[_PAIRS + 1], row[_PAIRS + 2] = s.touching[2], s.touching[3], s.touching[4]
     for k in range(len(ledger)):
         row[k] = ledger[k]
+    row[_PAIRS], row[_PAIRS + 1], row[_PAIRS + 2] = s.touching[2], s.touching[3], s.touching[4]
     stored = 0.0
     for k in range(_ENERGIES):
         row[_BARS[k]] = energies[k]

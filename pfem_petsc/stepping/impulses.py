@@ -151,7 +151,7 @@ class Impulses:
         external and damping force [N]."""
         stepper, state = self.stepper, self.state
         walls = stepper.solution.walls
-        self._before = self._of_walls(), self._of_turns()
+        self._before = self._given()
         if stepper.step_changed:
             stepper.scheme.step_changed(state)
         balance = stepper.scheme.balance(state, part)
@@ -167,21 +167,18 @@ class Impulses:
         for name, before in (("v", jump.v), ("a", jump.a), *jump.memory.items()):
             self._add(state.rates[name], jump.nodes, jump.walls, stepper.state.rates[name][jump.nodes] - before)
 
-    def _of_walls(self) -> np.ndarray:
-        """Return the impulses of walls (walls, 3), jumps included [N s]."""
-        v = self.state.v
-        return v[WALLS : WALLS + self.n_walls] + v[self.jumps : self.jumps + self.n_walls]
-
-    def _of_turns(self) -> np.ndarray:
-        """Return the angular impulses of walls about their axes, jumps included [N m s]; (0,) if none turns."""
-        first, n = self.turns, self._turning
-        return self.state.v[first : first + n, 0] + self.state.v[first + n : first + 2 * n, 0]
+    def _given(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return the impulses of walls (walls, 3) [N s], and the angular ones about their axes [N m s], (0,) if none
+        turns; jumps included."""
+        v, n, m = self.state.v, self.n_walls, self._turning
+        turns = v[self.turns : self.turns + m, 0] + v[self.turns + m : self.turns + 2 * m, 0]
+        return v[WALLS : WALLS + n] + v[self.jumps : self.jumps + n], turns
 
     def mean_pushes(self) -> tuple[np.ndarray, np.ndarray]:
         """Return the momentum that walls gave in the last step over its size, (walls, 3) [N], and the angular momentum
         about their axes, (walls,) [N m], or (0,) if none turns."""
-        part, (walls, turns) = self.stepper.part, self._before
-        return (self._of_walls() - walls) / part, (self._of_turns() - turns) / part
+        part, walls, turns = self.stepper.part, *self._given()
+        return (walls - self._before[0]) / part, (turns - self._before[1]) / part
 
     def _add(self, particles: np.ndarray, nodes: np.ndarray, walls: np.ndarray, change: np.ndarray) -> None:
         mass = self.stepper.model.inertia.mass  # treatments that set velocities require lumped mass

@@ -131,7 +131,10 @@ class BarChanges:
             scaled = model.bars.scaled_dissipation(before["_densities"], self._rest - before["_rest"])
         for k, block in enumerate(model.bars.blocks):
             part = slice(block.start, block.counted)
-            mean = self._mean_stress(before, k, block)
+            first, last, viscous = self._ends(before, k, block)
+            mean = 0.5 * (first + last) + viscous
+            if block.law.mean_of_work:
+                mean = self._mean_of_work(before, block, mean)
             rest = model.bars.rest[part]
             if model.rest_lengths.varying:
                 rest = 0.5 * (before["_rest"][part] + rest)
@@ -140,16 +143,8 @@ class BarChanges:
                 change = self._thermal[part] - before["_thermal"][part]
                 heating -= float((block.counted_area * rest * mean * change).sum())
                 if block.law.modulus is not None:
-                    heating += float((block.counted_area * rest * self._softening(before, k, block)).sum())
+                    heating += float((block.counted_area * rest * self._softening(before, block, first * last)).sum())
         return heating, stressing, scaled
-
-    def _mean_stress(self, before: dict, k: int, block: BarBlock) -> np.ndarray:
-        """Return the mean stress of the counted bars of a block in the step [Pa]."""
-        first, last, viscous = self._ends(before, k, block)
-        mean = 0.5 * (first + last) + viscous
-        if block.law.mean_of_work:
-            return self._mean_of_work(before, block, mean)
-        return mean
 
     def _mean_of_work(self, before: dict, block: BarBlock, mean: np.ndarray) -> np.ndarray:
         """Return the change of energies over that of strains of the counted bars of a block [Pa]; ``mean`` where these
@@ -181,11 +176,12 @@ class BarChanges:
         np.divide(lost, change, out=viscous, where=large)
         return first - left * begun[row + 1], last - left * ended[row + 1], viscous
 
-    def _softening(self, before: dict, k: int, block: BarBlock) -> np.ndarray:
-        """Return the work per volume [J/m3] that temperatures do by changing the modulus of the counted bars."""
+    def _softening(self, before: dict, block: BarBlock, square: np.ndarray) -> np.ndarray:
+        """Return the work per volume [J/m3] that temperatures do by changing the modulus of the counted bars;
+        ``square``: product of the stresses before and after [Pa2]."""
         part = slice(block.start, block.counted)
         moduli = (block.law.modulus(block.parameters, at[part]) for at in (before["_warmth"], self._warmth))
-        product = np.multiply(*self._ends(before, k, block)[:2]) * (1.0 / next(moduli) - 1.0 / next(moduli))
+        product = square * (1.0 / next(moduli) - 1.0 / next(moduli))
         if block.law.rupture >= 0:  # stresses are those of the share that is left
             left = 1.0 - np.abs(before["_state"][part])
             product = np.divide(product, left, out=np.zeros_like(product), where=left > 0.0)

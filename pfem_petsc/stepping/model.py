@@ -116,6 +116,8 @@ class Model:
     self_contact : SelfContact of bars with bars, or None
     can_touch : whether nodes can touch walls or each other
     start : where a stage starts from, None for the start of a run
+    first_step : number of the step at whose end the stage starts; 0 for the start of a run
+    origin : where the stage starts on the axis of the results, on which its own time is counted from zero
     """
 
     def __init__(
@@ -124,6 +126,7 @@ class Model:
         self.case = case
         self.comm = comm
         self.start: StageStart | None = None
+        self.first_step, self.origin = 0, 0.0
         self.warnings: list[str] = []
         self.mesh = mesh = self._load_mesh([case, *later]) if mesh is None else mesh
         self.nodes = resolve_node_sets(case, mesh)
@@ -189,19 +192,9 @@ class Model:
             mesh.n_connectors = mesh.n_bars - bars
         return mesh
 
-    @property
-    def first_step(self) -> int:
-        """Number of the step at whose end the stage starts; 0 for the start of a run."""
-        return self.start.step if self.start is not None else 0
-
-    @property
-    def origin(self) -> float:
-        """Where the stage starts on the axis of the results, on which its own time is counted from zero."""
-        return self.start.time if self.start is not None else 0.0
-
     def begin_stage(self, start: StageStart) -> None:
         """Hold supports, loads and walls that remain in force as they are at the start of a stage. Collective."""
-        self.start = start
+        self.start, self.first_step, self.origin = start, start.step, start.time
         self.supports.hold(start.position)
         active = self.comm.allreduce(bool(start.force.any()) or bool(start.gravity.any()), op=MPI.LOR)
         self.external.hold(start.force, start.gravity, start.wind, active)

@@ -88,30 +88,21 @@ class PrescribedMotion:
     def prescribe(self, balance: Balance) -> None:
         """Set exact positions, velocities and accelerations of prescribed components in a balance; their increments are
         zero. The scheme's own formulas would derive velocities and accelerations from positions and oscillate."""
-        supports = self.supports
-        forces_hold = sum(weight * time for weight, time in balance.loads)
-        v, a = supports.rates(forces_hold, self.stepper.part)
-        self._ruled = self._by_rule(balance, a)
-        balance.predictor = balance.predictor.copy()
-        supports.place(balance.predictor, supports.positions(balance.time))
-        balance.v_hat = np.zeros_like(self.stepper.state.v) if balance.v_hat is None else balance.v_hat.copy()
-        supports.put(balance.v_hat, v)
-        balance.a_hat = np.zeros_like(self.stepper.state.v) if balance.a_hat is None else balance.a_hat.copy()
-        supports.put(balance.a_hat, a)
-
-    def _by_rule(self, balance: Balance, a: np.ndarray) -> State:
-        """Return the state of prescribed components (k, 1) if the scheme advanced them with accelerations (k,).
-
-        This is the rule by which forces become impulses.
-        """
-        supports, ruled = self.supports, self._along()
+        supports, stepper = self.supports, self.stepper
+        v, a = supports.rates(sum(weight * time for weight, time in balance.loads), stepper.part)
+        # what the scheme would make of these accelerations, by the rule by which forces become impulses
         known = {name: getattr(balance, name) for name in ("predictor", "v_hat", "a_hat")}
         own = replace(
             balance, **{name: None if each is None else supports.get(each)[:, None] for name, each in known.items()}
         )
+        self._ruled = self._along()
         u = (a[:, None] if own.a_hat is None else a[:, None] - own.a_hat) / own.alpha
-        self.stepper.scheme.finish(ruled, own, u, self.stepper.part)
-        return ruled
+        stepper.scheme.finish(self._ruled, own, u, stepper.part)
+        balance.predictor, balance.v_hat = balance.predictor.copy(), balance.v_hat.copy()
+        balance.a_hat = np.zeros_like(balance.v_hat) if balance.a_hat is None else balance.a_hat.copy()
+        supports.place(balance.predictor, supports.positions(balance.time))
+        supports.put(balance.v_hat, v)
+        supports.put(balance.a_hat, a)
 
     def take_rates(self, time: float) -> None:
         """Set velocity, acceleration and scheme memory of prescribed components at a time [s]."""
@@ -535,7 +526,7 @@ class Stepper(ABC):
                 self.removals.release(entry, self.recorded()[1], self.state.time)
                 self.supports_changed()
             elif share == 1.0:
-                self.removals.finish(entry)
+                self.model.external.reactions.pop(entry.supports, None)
                 self.load_ended()
         return changed
 

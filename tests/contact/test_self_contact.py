@@ -298,6 +298,18 @@ def test_single_steps_are_those_of_calls(tmp_path):
 
 
 @pytest.mark.slow
+def test_rows_within_calls_are_those_of_single_steps(tmp_path):
+    """A call of many steps has the columns of each row, not of its last step alone."""
+    case = chains(time={"step": 2e-5})
+    rows, _ = rows_of(case, MPI.COMM_SELF, tmp_path, "steps")
+    with Simulation(case, MPI.COMM_SELF, output=tmp_path / "calls", quiet=True) as simulation:
+        simulation.run()
+    history = open_result(tmp_path / "calls").history
+    for name in ("self_contact/contacts", "self_contact/overlap", "self_contact/force"):
+        np.testing.assert_array_equal(history[name][-len(rows) :], column(rows, name))
+
+
+@pytest.mark.slow
 @pytest.mark.parallel
 def test_a_restart_continues_to_the_bit(comm, shared_tmp_path):
     tables = {"time": {"step": 2e-5, "end": 8e-3}, "self_contact": {"friction": 0.3, "restitution": 0.8}}

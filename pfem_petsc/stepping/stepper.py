@@ -426,8 +426,8 @@ class Stepper(ABC):
 
     @property
     def jump(self) -> Any:
-        """Velocity jumps of the treatment in the last part, see :mod:`~pfem_petsc.contact.treatments.base`; None if there
-        were none."""
+        """Velocity jumps of the treatment in the last part, None if there were none; see
+        :mod:`~pfem_petsc.contact.treatments.base`."""
         return None if self.treatment is None else self.treatment.jump
 
     @property

@@ -320,7 +320,12 @@ class ConstraintSet:
         moved = rows.along(rows.fixed_jacobian, x - start) if self.rebounds else np.empty(0)
         pull = rows.along(rows.fixed_jacobian, drift) - moved if self.rebounds else moved
         lift, before = self._lift(pull), self.force > 0.0
-        pushes, self.jacobian, system = rows.project(nodes, self.contact.tolerance, stopping, lift)
+        force = np.zeros(len(before))
+        try:
+            pushes, self.jacobian, system = rows.project(nodes, self.contact.tolerance, stopping, lift)
+            force = pushes.force
+        finally:
+            self.two.agree(force)  # also after a failure, which other ranks may not have
         self.force, self.drag, self.friction = pushes.force, pushes.drag, 0.0
         if self.rebounds:
             fresh, arrived = (self.force > 0.0) & ~before & (rows.restitution > 0.0), rows.values(start)

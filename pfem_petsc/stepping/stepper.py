@@ -26,7 +26,6 @@ from ..tolerances import BEYOND, ON_BOUND, TIME
 from .bar_events import Collapse, Removals, Ruptures, collapse_message
 
 if TYPE_CHECKING:
-    from ..contact.treatments.base import Jump
     from .model import Model
 
 
@@ -427,8 +426,9 @@ class Stepper(ABC):
         return f"step {self.model.first_step + step}, {place}"
 
     @property
-    def jump(self) -> Jump | None:
-        """Velocity jumps of the treatment in the last part; None if there were none."""
+    def jump(self) -> Any:
+        """Velocity jumps of the treatment in the last part, see :mod:`~pfem_petsc.contact.treatments.base`; None if there
+        were none."""
         return None if self.treatment is None else self.treatment.jump
 
     @property

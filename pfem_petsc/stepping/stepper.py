@@ -427,8 +427,8 @@ class Stepper(ABC):
 
     @property
     def jump(self) -> Any:
-        """Velocity jumps of the treatment in the last part, see :mod:`~pfem_petsc.contact.treatments.base`; None if there
-        were none."""
+        """Velocity jumps of the treatment in the last part, see :mod:`~pfem_petsc.contact.treatments.base`; None if
+        there were none."""
         return None if self.treatment is None else self.treatment.jump
 
     @property

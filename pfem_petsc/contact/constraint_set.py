@@ -299,8 +299,13 @@ class ConstraintSet:
         lift, before = 0.0, self.force > 0.0
         if self.rebounds and self.rebound.any():  # bounds of rows that rebound are above zero
             lift = rebound_lift(rows.restitution, self.rebound, self.arrival, pull)
-        pushes, self.gradients = rows.project(nodes, self.contact.tolerance, stopping, lift)
-        self.force, self.drag, self.friction = pushes.normal, pushes.drag, 0.0
+        force = np.zeros(len(before))
+        try:
+            pushes, self.gradients = rows.project(nodes, self.contact.tolerance, stopping, lift)
+            force = pushes.normal
+        finally:
+            self.two.agree(force)  # also after a failure, which other ranks may not have
+        self.force, self.drag, self.friction = force, pushes.drag, 0.0
         if self.rebounds:
             fresh, arrived = (self.force > 0.0) & ~before & (rows.restitution > 0.0), rows.values(start)
             self.rebound = np.where(fresh, impact_square(-moved, arrived, pull), 0.0)

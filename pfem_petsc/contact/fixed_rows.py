@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from ..mesh.exchange import swap
 from .rows import RowSet
 
 
@@ -30,6 +31,9 @@ class TwoNodeRows:
         self.ends = np.ascontiguousarray(rows.ends[self.at, :2].T)
         self.nodes = rows.where[self.ends]
         self.counted = rows.counted[self.at]
+        mine = self.nodes >= 0
+        self._cut = np.flatnonzero(mine[0] != mine[1])
+        self._others = rows.owners[self.at[self._cut], np.where(mine[0, self._cut], 1, 0)]
         self.normals = np.ascontiguousarray(gradients[self.at, 1])
         self.least = np.empty(0)
         if len(self.at):
@@ -37,6 +41,14 @@ class TwoNodeRows:
         self._free = rows.free[self.ends]
         self.along = (self._free * self.normals**2).sum(axis=2)
         self.restitution = rows.restitution[self.at]
+
+    def agree(self, force: np.ndarray) -> None:
+        """Replace forces (r,) of the set's rows, where two ranks have them, by those of the rank of the second node: if
+        they differed by rounding, a row could be closed on one rank only. Collective."""
+        if len(self._cut):
+            at = self.at[self._cut]
+            theirs = swap(self.rows.mesh.comm, self._others, force[at, None])[:, 0]
+            force[at] = np.where(self.counted[self._cut], force[at], theirs)
 
     def gather(self, values: np.ndarray) -> np.ndarray:
         """Return values (2, p, ...) at the nodes of rows from those at owned nodes (owned, ...). Collective."""

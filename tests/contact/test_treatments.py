@@ -197,7 +197,7 @@ CONSERVING = (
         ({"contact": {"treatment": "conserving"}}, CONSERVING),
         (
             {"contact": {"treatment": "mass_redistribution"}},
-            "must be a plane, not curved nor a rectangle, and name a node_set",
+            "must be a plane, not curved nor a rectangle, must not turn, and name a node_set",
         ),
         ({"contact": {"treatment": "sticky"}}, "contact.treatment"),
     ],

@@ -120,7 +120,7 @@ def test_killed_between_the_last_checkpoint_and_the_end_of_the_results(comm, sha
         raise Killed
 
     with monkeypatch.context() as patch:
-        writer, name = (History, "record") if lost == "row" else (Snapshots, "write")
+        writer, name = (History, "record") if lost == "row" else (Snapshots, "observe")
         done = getattr(writer, name)
         patch.setattr(writer, name, killed)
         simulation = Simulation(Case.load(case, overrides), comm, output=folders[1], quiet=True)

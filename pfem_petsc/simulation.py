@@ -114,6 +114,8 @@ class Simulation(WithEquations):
         self.mesh = self.model.mesh
         if number == 0:
             check_start(self.model.contact, self.mesh.points[: self.mesh.n_owned], self.model.size)
+            if self.model.self_contact is not None:
+                self.model.self_contact.check_start(self.mesh.points)
         if self.restart is not None and not self.finished:
             RunState(self.stepper).restore(self.restart.file, case.source)
         minutes = case.output.checkpoint_minutes

@@ -16,21 +16,27 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from ..errors import InputError
+from ..tolerances import BEYOND
 from .wall_motion import Poses
 
 if TYPE_CHECKING:
     from .walls.base import BaseWall
 
 _SHARE = 0.2  # of the lighter node's mass over the square of the step, and of what this leaves, that is the stiffness
+_PART = 0.1  # of the stiffness that a wall with mass may still have, for the bars that begin to touch it in a step
 _CRITICAL = exp(-2.0)  # restitution of a damper with which nothing swings back; walls with less get it
 _BESIDE = 1e-7  # part of the length at which normals beside the place are taken
 _NEXT_TO = 1e-6  # way by which positions differ for derivatives, over the length of a bar
+_MIDDLE = 0.45  # of the thickness of a sheet, from which bars have passed it
 _DEEPER = 0.25  # of the width of a wall, by which an iteration may move bars into it
+_PLACES = 50  # at most, on the way of bars in a step, at which they are looked for in walls
 _SKIN = 0.5  # distance from a wall up to which bars are listed, over the mean length of bars
 
-SPRING, NORMAL, FORCE, MOMENT, PLACE, DAMPER, WIDTH = 0, 3, 6, 9, 12, 13, 14
+SPRING, NORMAL, FORCE, MOMENT, PLACE, DAMPER, STIFFNESS, WIDTH = 0, 3, 6, 9, 12, 13, 14, 15
 """Columns of the memory of a bar at a wall: elastic part of the slip [m]; normal; force on the bar [N], and its moment
-about the origin [N m]; where it acts, from 0 to 1 along the bar; and the part of the damper along the normal [N]."""
+about the origin [N m]; where it acts, from 0 to 1 along the bar; the part of the damper along the normal [N]; and the
+stiffness [N/m]."""
 
 
 def restitution_of(damping: float) -> float:
@@ -144,6 +150,11 @@ class BarsAtWalls:
         self._before, self.force = mesh.points.copy(), np.zeros((mesh.n_owned, 3))
         self.sums, self.met = np.zeros((2, len(contact.walls), 3)), np.zeros(len(contact.walls), dtype=bool)
         self.take(np.empty((0, 2 + WIDTH)), mesh.points[: mesh.n_owned])
+        for k in self.walls:
+            if contact.ties.any and contact.ties.tying[contact.first[k]]:
+                model.warnings.append(
+                    f"wall {contact.names[k]!r} ties nodes only: bars that touch it between their nodes slide on it"
+                )
 
     @property
     def touches(self) -> bool:
@@ -163,6 +174,31 @@ class BarsAtWalls:
         self._near[k] = bars, there.copy()
         return bars
 
+    def _limited(self, k: int, bars: np.ndarray, touched: np.ndarray, before: np.ndarray) -> np.ndarray:
+        """Return the stiffness (m,) of bars at wall k: theirs along the axis, unless an explicit step requires less; of
+        those that have ``touched`` it (m,) what it was ``before`` (m,). Collective if the wall has mass."""
+        stiffness, room = self._model.bars.stiffness[self._bars[bars]], self._model.self_contact.room
+        if not room:
+            return stiffness
+        stiffness = np.minimum(_SHARE * room * self._mass[bars].min(axis=1, initial=np.inf), stiffness)
+        mass = self._wall_mass(k)
+        if mass < np.inf:  # bars that begin to touch share a part of what is left
+            mine = self._counted[bars]
+            sums = np.array([before[mine & touched].sum(), np.count_nonzero(mine & ~touched)])
+            used, fresh = self._mesh.comm.allreduce(sums)
+            left = _PART * max(_SHARE * room * mass - used, 0.0) / max(fresh, 1.0)
+            stiffness = np.minimum(stiffness, np.where(touched, before, left))
+        return stiffness
+
+    def _wall_mass(self, k: int) -> float:
+        """Return the least mass [kg] that wall k has for a push anywhere on it, infinite if it moves as prescribed."""
+        bodies, reach = self._contact.motion.bodies, 0.5 * self._contact.walls[k].width
+        for i in np.flatnonzero(bodies.at == k):
+            motions, inertia = bodies.inertias(i)
+            motions = motions * np.repeat([1.0, reach], 3)
+            return 1.0 / float(np.linalg.eigvalsh(motions.T @ np.linalg.solve(inertia, motions))[-1])
+        return np.inf
+
     def _touching(
         self, x: np.ndarray, step: float, time: float
     ) -> Iterator[tuple[int, np.ndarray, np.ndarray, BarContacts, BarMotion]]:
@@ -178,15 +214,12 @@ class BarsAtWalls:
             touched = np.isin(keys, self._keys)
             t, gaps = contact.walls[k].deepest(poses.rest(k, x[bars_here[bars]]))
             found = (gaps < 0.0) | touched
-            if not found.any():
-                continue
             keys, bars, touched = keys[found], bars[found], touched[found]
             memory = np.zeros((len(keys), WIDTH))
             memory[touched] = self._memory[np.searchsorted(self._keys, keys[touched])]
-            stiffness = self._model.bars.stiffness[self._bars[bars]]
-            if self._model.self_contact.room:  # what an explicit step allows
-                most = _SHARE * self._model.self_contact.room * self._mass[bars].min(axis=1)
-                stiffness = np.minimum(most, stiffness)
+            stiffness = self._limited(k, bars, touched, memory[:, STIFFNESS])
+            if not len(keys):
+                continue
             ends = bars_here[bars]
             here = BarContacts(stiffness, self._inverse[bars], memory, touched)
             yield (
@@ -270,6 +303,54 @@ class BarsAtWalls:
                     least, limiting = 0.99 * float(parts[at]), f"bar {bar} and wall {contact.names[k]!r}"
         return least, limiting
 
+    def crossing(self, x: np.ndarray, time: float) -> str:
+        """Return the names of a bar and a wall that have passed through each other on the straight way from the
+        positions that were committed last to x (local, 3) at a time [s], empty if none has. Collective."""
+        contact, ends, here = self._contact, self._mesh.bars[self._bars], ""
+        poses = contact.motion.poses(time)
+        earlier = poses if self._begun is None else contact.motion.poses(self._begun)
+        for i, k in enumerate(self.walls):
+            wall = contact.walls[k]
+            start, end = earlier.rest(k, self._before), poses.rest(k, x)
+            most = np.linalg.norm(end - start, axis=1)[ends].max(axis=1, initial=0.0)
+            fast = np.flatnonzero((most > _DEEPER * wall.depth) & self._applies[:, i])
+            middle = 0.5 * (start[ends[fast]].sum(axis=1) + end[ends[fast]].sum(axis=1)) / 2.0
+            long = np.linalg.norm(start[ends[fast, 1]] - start[ends[fast, 0]], axis=1)
+            fast = fast[wall.gaps(middle) < 0.5 * long + most[fast]]
+            if not len(fast):
+                continue
+            first, last = (wall.deepest(there[ends[fast]])[1] for there in (start, end))
+            count = min(int(most[fast].max() / (_DEEPER * wall.depth)) + 2, _PLACES)
+            for part in np.linspace(0.0, 1.0, count)[1:-1]:
+                between = (1.0 - part) * start[ends[fast]] + part * end[ends[fast]]
+                passed = wall.deepest(between)[1] < np.minimum(np.minimum(first, last), 0.0) - _DEEPER * wall.depth
+                if passed.any():
+                    bar = self._mesh.bar_ids[self._bars[fast[passed.argmax()]]]
+                    here = f"bar {bar} and wall {contact.names[k]!r}"
+        return max(self._mesh.comm.allgather(here))
+
+    def check_start(self, x: np.ndarray, length: float) -> None:
+        """Check that no bar starts in a wall, with nodes at x (local, 3), in a model of a ``length`` [m]. Collective.
+
+        Raises
+        ------
+        InputError
+            On all ranks; names the wall, the bar and its depth.
+        """
+        contact, poses, worst = self._contact, self._contact.motion.poses(0.0), (0.0, 0, 0)
+        for i, k in enumerate(self.walls):
+            bars = np.flatnonzero(self._applies[:, i])
+            gaps = contact.walls[k].deepest(poses.rest(k, x[self._mesh.bars[self._bars[bars]]]))[1]
+            if len(gaps) and gaps.min() < -BEYOND * length:
+                worst = min(worst, (float(gaps.min()), k, int(self._mesh.bar_ids[self._bars[bars[gaps.argmin()]]])))
+        depth, k, bar = min(self._mesh.comm.allgather(worst))
+        if depth < 0.0:
+            raise InputError(
+                f"{contact.source}: wall {contact.names[k]!r}: bar {bar} starts {-depth:.6g} m in it, between its "
+                "nodes; move the wall or the mesh, divide the bar, or name the bars that touch with self_contact.bars, "
+                "or the nodes of the wall with 'node_set'"
+            )
+
     def table(self) -> np.ndarray:
         """Return walls, bars and memory (m, 2 + WIDTH) of the counted bars that touch, for a checkpoint."""
         walls, bars = np.divmod(self._keys, max(len(self._bars), 1))
@@ -319,7 +400,7 @@ class BarsAtWalls:
         length, left = np.linalg.norm(old, axis=1), np.linalg.norm(flat, axis=1)
         flat *= np.where(left > 0.0, length / np.maximum(left, 1e-300), 0.0)[:, None]
         trial = flat + flat_slip
-        size, most = np.linalg.norm(trial, axis=1), friction * total / stiffness
+        size, most = np.linalg.norm(trial, axis=1), friction * total / np.maximum(stiffness, 1e-300)
         end = trial * np.where(size > most, most / np.maximum(size, 1e-300), 1.0)[:, None]
         force = total[:, None] * normals - stiffness[:, None] * end
         rubbed = 0.5 * stiffness * np.einsum("mi,mi->m", flat + end, trial - end)
@@ -327,8 +408,10 @@ class BarsAtWalls:
         damping = damper[:, None] * normals + here.memory[:, DAMPER, None] * before
         lost = rubbed - 0.5 * np.einsum("mi,mi->m", damping, slip)
         passed = touch & here.touched & (np.einsum("mi,mi->m", before, normals) < 0.0)
+        if wall.thickness is not None:  # beyond the middle of a sheet nothing pushes bars back
+            passed |= gaps < -_MIDDLE * wall.thickness
         stored = np.where(touch, 0.5 * stiffness * (gaps**2 + np.einsum("mi,mi->m", end, end)), 0.0)
-        memory = np.column_stack([end, normals, force, np.cross(point, force), t, damper])
+        memory = np.column_stack([end, normals, force, np.cross(point, force), t, damper, stiffness])
         return Response(touch, passed, weights[:, :, None] * force[:, None, :], stored, lost, memory)
 
     def _wall_mobility(self, k: int, point: np.ndarray, normals: np.ndarray) -> np.ndarray | float:
@@ -410,10 +493,7 @@ class Piercing:
             if count and k not in self.first:
                 self.first[k] = at
                 bars = f"bar {bar} intersects" if count == 1 else f"{count} bars, including bar {bar}, intersect"
-                told.append(
-                    f"{at}: {bars} wall {self._model.contact.names[k]!r}: only nodes touch walls; "
-                    "use shorter bars or a larger wall"
-                )
+                told.append(f"{at}: {bars} wall {self._model.contact.names[k]!r}: {self._why(k)}")
         return told
 
     def _across(self, i: int, k: int, x: np.ndarray, poses: Poses) -> tuple[int, int]:
@@ -424,12 +504,19 @@ class Piercing:
         ids = mesh.bar_ids[mesh.counted][rows[wall.crossed(starts, ends)]]
         return len(ids), int(ids.min()) if len(ids) else int(np.iinfo(np.int64).max)
 
+    def _why(self, k: int) -> str:
+        """Return why bars are in wall k, and what to do about it."""
+        touch = self._model.self_contact
+        if touch is not None and touch.at_walls is not None and k in touch.at_walls.walls:
+            return "bars that touch are pressed into it, or not all bars do; use a smaller step, or all bars"
+        return "only nodes touch walls; use shorter bars or a larger wall"
+
     def summary(self) -> list[str]:
         """Return messages for the end of the run, about walls that bars intersected again after the first message."""
         names = self._model.contact.names
         return [
             f"bars intersected wall {names[k]!r} in {self.seen[k]} of {self.looks} snapshots, first at "
-            f"{self.first[k]}: only nodes touch walls"
+            f"{self.first[k]}: {self._why(k).partition('; ')[0]}"
             for k in self.walls
             if self.seen[k] > 1
         ]

@@ -743,6 +743,7 @@ class SelfContact:
     def hint(self) -> str:
         """Return what to add to the message about a solve that did not converge. Collective."""
         depth = self.comm.allreduce(float(self.sums[DEPTH]), op=MPI.MAX)
+        self.between = max(self.comm.allgather(self.between))
         if self.between:
             return f". {self.between[0].upper()}{self.between[1:]} would have passed through each other in an iteration"
         return f". Bars overlap by {100.0 * depth:.0f} % of a radius" if depth > _DEEP else ""
@@ -906,9 +907,14 @@ class SelfContact:
             self.deepest = max(self.deepest, float(sums[DEPTH]))
         stored = float(sums[ENERGY])
         if self.at_walls is not None:
+            if not self.implicit and commit:
+                crossing = self.at_walls.crossing(x, self._model.contact.state.time)
+                self._report(crossing, f" pass through each other{unprevented}")
             more, lost = self.at_walls.add_forces(x, f, step, commit)
             if not self.implicit or commit:
                 self._report(self.at_walls.passed, unprevented)
+            elif self.at_walls.passed:
+                self.between = self.at_walls.passed.replace(" passes through ", " and ")
             stored += more
             self.dissipated += lost if commit else 0.0
         return stored, self.dissipated
@@ -926,6 +932,11 @@ class SelfContact:
             return walls
         force, moment = self.pushes(x, weight)
         return replace(walls, force=walls.force + force, moment=walls.moment + moment)
+
+    def crossing(self, x: np.ndarray, time: float) -> str:
+        """Return the names of a bar and a wall that have passed through each other in a step to x (local, 3) at a time
+        [s], see :meth:`~pfem_petsc.contact.bars_at_walls.BarsAtWalls.crossing`. Collective."""
+        return "" if self.at_walls is None else self.at_walls.crossing(x, time)
 
     def way_left(self) -> float:
         """Return how far bars may come closer until :meth:`evaluate` is needed again [m]: zero unless this is known on
@@ -1147,6 +1158,20 @@ class SelfContact:
         self._take(arrays.get("self_contact.pairs", np.empty((0, WIDTH + 3))), x)
         if self.at_walls is not None:
             self.at_walls.take(arrays.get("self_contact.walls", np.empty((0, 2 + BAR_WIDTH))), x)
+
+    def check_start(self, x: np.ndarray, earlier: SelfContact | None = None) -> None:
+        """Check that no bar starts in a wall between its nodes, at positions (local, 3), unless bars and walls are
+        those of an ``earlier`` stage. Collective.
+
+        Raises
+        ------
+        InputError
+            On all ranks; names the wall, the bar and its depth.
+        """
+        before = None if earlier is None else earlier.at_walls
+        same = before is not None and self.at_walls is not None and before.names == self.at_walls.names
+        if self.at_walls is not None and not (same and np.array_equal(self.chosen, earlier.chosen)):
+            self.at_walls.check_start(x, self._model.size)
 
     def overlap_at_start(self, earlier: SelfContact | None) -> float:
         """Return the largest overlap [m] of bars at the start of a stage that other bars or radii of the stage before,

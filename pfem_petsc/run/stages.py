@@ -218,6 +218,8 @@ class Stages:
             for function in self.functions if stage.time is not None else ():
                 model.external.call(function)
             check_start(model.contact, old.state.position, model.size, adjusts=False)
+            if model.self_contact is not None:
+                model.self_contact.check_start(old.state.x, old.model.self_contact)
             stepper = _make_stepper(model, self.plan.record["stages"][number])
         except InputError as error:
             raise SimulationFailure(f"{where}: {error}") from error

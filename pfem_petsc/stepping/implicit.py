@@ -285,6 +285,12 @@ class ImplicitStepper(Stepper):
             if touch is not None:
                 x = self.with_ghosts(balance.predictor + found[-1].u)
                 walls = found[-1].walls = touch.with_walls(walls, x, balance.weight)
+                crossing = touch.crossing(x, balance.time)
+                if crossing:
+                    raise NotConverged(
+                        f"{self.when(balance)}: {crossing} pass through each other in the step; {self.remedy}",
+                        "bars pass through walls",
+                    )
             return np.stack([walls.force, walls.moment])[:, bodies.at], None
 
         if not bodies.solve(forces, ON_BOUND * self.model.size):

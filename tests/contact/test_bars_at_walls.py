@@ -6,7 +6,7 @@ from helpers.lattices import rows_of
 from helpers.stopped import assert_as_on_one_rank, assert_restart_is_bitwise
 from helpers.triangles import box, write_surface
 
-from pfem_petsc import Case, SimulationFailure
+from pfem_petsc import Case, InputError, SimulationFailure
 from pfem_petsc.contact.bars_at_walls import damping_of
 
 BALL = {"type": "sphere", "point": [0.0, 0.0, 0.0], "radius": 0.5}
@@ -113,6 +113,38 @@ def test_bar_that_is_driven_through_a_sheet_ends_the_run(comm, shared_tmp_path):
     case = falling(wall, [[-1.0, 0.0, 0.03], [1.0, 0.0, 0.03]], (0.0, 0.0, -40.0), step=2e-4, end=0.01)
     with pytest.raises(SimulationFailure, match="bar 0 passes through wall 'w', which the stiffness of"):
         rows_of(case, comm, shared_tmp_path)
+
+
+@pytest.mark.parametrize(("integrator", "step"), [("central_differences", 1e-3), ("generalized_alpha", 2e-3)])
+def test_bar_does_not_jump_over_a_wall(integrator, step, comm, shared_tmp_path):
+    """Fast bars pass a thin wall within a step, which ends the run, or reduces an implicit step until they touch."""
+    wall = {"type": "cylinder", "point": [0.0, 0.0, 0.0], "axis": [0.0, 1.0, 0.0], "radius": 0.02, "restitution": 1.0}
+    case = falling(wall, [[-1.0, 0.0, 0.05], [1.0, 0.0, 0.05]], (0.0, 0.0, -90.0), step=step, end=4e-3)
+    case["material"]["m"]["young_modulus"] = 1e9
+    case["time"]["integrator"] = integrator
+    with pytest.raises(SimulationFailure, match="ar 0 (and|passes through) wall 'w'"):
+        rows_of(case, comm, shared_tmp_path)
+
+
+def test_light_wall_with_mass(comm, shared_tmp_path):
+    """The stiffness is limited by its mass: a bar of 200 g throws a sphere of 1 g ahead, v2 = 2 m1/(m1 + m2) v."""
+    case = falling({**BALL, "restitution": 1.0, "mass": 1e-3}, step=1e-3, end=0.06)
+    rows, run = rows_of(case, comm, shared_tmp_path)
+    assert rows[-1]["wall/w/velocity"][2] == pytest.approx(-2.0 * 0.2 / 0.201, rel=0.01)
+    np.testing.assert_allclose(run.state.v[:, 2], -(0.2 - 1e-3) / 0.201, rtol=1e-3)
+    assert abs(rows[-1]["numerical_dissipation"]) < 1e-3 * 0.5 * MASS
+
+
+@pytest.mark.parallel
+def test_bar_that_starts_in_a_wall_is_refused(comm, shared_tmp_path):
+    case = falling(BALL, [[-1.0, 0.0, 0.4], [1.0, 0.0, 0.4]])
+    with pytest.raises(InputError, match="wall 'w': bar 0 starts 0.1 m in it, between its nodes; move the wall"):
+        rows_of(case, comm, shared_tmp_path)
+
+
+def test_tied_wall_is_told(comm, shared_tmp_path):
+    _, run = rows_of(falling({**BALL, "tied": True}, end=2e-4), comm, shared_tmp_path)
+    assert any("wall 'w' ties nodes only" in text for text in run.model.warnings)
 
 
 @pytest.mark.slow

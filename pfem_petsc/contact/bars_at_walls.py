@@ -77,10 +77,12 @@ def _applying(model: Any, walls: list[int], bars: np.ndarray | slice) -> np.ndar
 
 
 class BarContacts(NamedTuple):
-    """Bars (m,) that may touch a wall: ``stiffness`` (m,) [N/m], and ``inverse`` masses of their nodes (m, 2) [1/kg],
-    zero where supports hold these; ``memory`` (m, WIDTH) of the start of the step, and who ``touched`` (m,) then."""
+    """Bars (m,) that may touch a wall: ``stiffness`` (m,) [N/m], ``count`` (m,) of walls that their bars touch, and
+    ``inverse`` masses of their nodes (m, 2) [1/kg], zero where supports hold these; ``memory`` (m, WIDTH) of the start
+    of the step, and who ``touched`` (m,) then."""
 
     stiffness: np.ndarray
+    count: np.ndarray
     inverse: np.ndarray
     memory: np.ndarray
     touched: np.ndarray
@@ -207,28 +209,62 @@ class BarsAtWalls:
         contact, bars_here = self._contact, self._mesh.bars[self._bars]
         poses = contact.motion.poses(time)
         earlier = poses if self._begun is None else contact.motion.poses(self._begun)
+        n, places = len(self._bars), []
         for i, k in enumerate(self.walls):
-            near = i * len(self._bars) + self._candidates(k, x, poses)
-            keys = np.union1d(near, self._keys[self._keys // max(len(self._bars), 1) == i])
-            bars = keys - i * len(self._bars)
-            touched = np.isin(keys, self._keys)
-            t, gaps = contact.walls[k].deepest(poses.rest(k, x[bars_here[bars]]))
-            found = (gaps < 0.0) | touched
-            keys, bars, touched = keys[found], bars[found], touched[found]
-            memory = np.zeros((len(keys), WIDTH))
-            memory[touched] = self._memory[np.searchsorted(self._keys, keys[touched])]
-            stiffness = self._limited(k, bars, touched, memory[:, STIFFNESS])
-            if not len(keys):
-                continue
-            ends = bars_here[bars]
-            here = BarContacts(stiffness, self._inverse[bars], memory, touched)
-            yield (
-                k,
-                keys,
-                ends,
-                here,
-                BarMotion(x[ends], t[found], gaps[found], self._before[ends], poses, earlier, step),
-            )
+            near = i * n + self._candidates(k, x, poses)
+            keys = np.union1d(near, self._keys[self._keys // max(n, 1) == i])
+            t, gaps = contact.walls[k].deepest(poses.rest(k, x[bars_here[keys - i * n]]))
+            found = (gaps < 0.0) | np.isin(keys, self._keys)
+            places.append((keys[found], t[found], gaps[found]))
+        keys, t, gaps = (np.concatenate(parts) for parts in zip(*places, strict=True))
+        touched, memory = np.isin(keys, self._keys), np.zeros((len(keys), WIDTH))
+        memory[touched] = self._memory[np.searchsorted(self._keys, keys[touched])]
+        stiffness, count = self._stiffness(keys, touched, memory[:, STIFFNESS])
+        for i, k in enumerate(self.walls):
+            at = np.flatnonzero(keys // max(n, 1) == i)
+            if len(at):
+                bars = keys[at] - i * n
+                ends = bars_here[bars]
+                here = BarContacts(stiffness[at], count[at], self._inverse[bars], memory[at], touched[at])
+                yield (
+                    k,
+                    keys[at],
+                    ends,
+                    here,
+                    BarMotion(x[ends], t[at], gaps[at], self._before[ends], poses, earlier, step),
+                )
+
+    def _stiffness(self, keys: np.ndarray, touched: np.ndarray, before: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the stiffness (m,) of contacts by their keys, and how many their bars have (m,). Collective.
+
+        It is that of the bar along its axis, unless an explicit step requires less; contacts that have ``touched`` (m,)
+        keep what they had ``before`` (m,), and those that begin share what these leave to their bar, and to a wall with
+        mass."""
+        walls, bars = np.divmod(keys, max(len(self._bars), 1))
+        axial, room = self._model.bars.stiffness[self._bars[bars]], self._model.self_contact.room
+        each, place, count = np.unique(bars, return_inverse=True, return_counts=True)
+        if not room:
+            return axial, count[place]
+        used, fresh = (np.bincount(place, values, len(each)) for values in (before * touched, ~touched))
+        most = 2.0 * _SHARE * room * self._mass[each].min(axis=1, initial=np.inf)
+        left = np.minimum(axial, (0.5 * np.maximum(most - used, 0.0) / np.maximum(fresh, 1.0))[place])
+        for i, k in enumerate(self.walls):
+            mass, here = self._wall_mass(k), walls == i
+            if mass < np.inf:
+                mine = self._counted[bars] & here
+                sums = np.array([before[mine & touched].sum(), np.count_nonzero(mine & ~touched)])
+                used, fresh = self._mesh.comm.allreduce(sums)
+                left[here] = np.minimum(left[here], _PART * max(_SHARE * room * mass - used, 0.0) / max(fresh, 1.0))
+        return np.where(touched, before, left), count[place]
+
+    def _wall_mass(self, k: int) -> float:
+        """Return the least mass [kg] that wall k has for a push anywhere on it, infinite if it moves as prescribed."""
+        bodies, reach = self._contact.motion.bodies, 0.5 * self._contact.walls[k].width
+        for i in np.flatnonzero(bodies.at == k):
+            motions, inertia = bodies.inertias(i)
+            motions = motions * np.repeat([1.0, reach], 3)
+            return 1.0 / float(np.linalg.eigvalsh(motions.T @ np.linalg.solve(inertia, motions))[-1])
+        return np.inf
 
     def add_forces(self, x: np.ndarray, f: np.ndarray, step: float, commit: bool) -> tuple[float, float]:
         """Add the forces at positions x (local, 3) [m], a ``step`` [s] after those that were committed last, to
@@ -428,8 +464,8 @@ class BarsAtWalls:
     ) -> np.ndarray:
         """Return the forces (m,) of springs with a damper, which pull never [N], from ``push``, closing way and
         mobility (m,) of each ``spring``; in explicit steps the velocity is that at the end of the step, half a step
-        later, by the force itself. In steps that solve equations, which had no solution if a force jumped, dampers of
-        bars that begin to touch follow a step later."""
+        later, by the force itself and those of the other walls that the bar touches. In steps that solve equations,
+        which had no solution if a force jumped, dampers of bars that begin to touch follow a step later."""
         restitution = float(self._contact.restitution[self._contact.first[k]])
         push, closing, mobility = spring
         if restitution >= 1.0 or step <= 0.0:
@@ -437,7 +473,8 @@ class BarsAtWalls:
         implicit = self._model.self_contact.implicit
         ratio = 2.0 * damping_of(max(restitution, _CRITICAL))
         drag = ratio * np.sqrt(here.stiffness / np.maximum(mobility, 1e-300)) * (mobility > 0.0)
-        total = (push - drag * closing / step) / (1.0 + (0.0 if implicit else 0.5) * drag * step * mobility)
+        lead = 0.0 if implicit else 0.5 * here.count
+        total = (push - drag * closing / step) / (1.0 + lead * drag * step * mobility)
         return np.where(push > 0.0 if not implicit else here.touched & (push > 0.0), np.maximum(total, 0.0), push)
 
 

@@ -83,6 +83,7 @@ _STILL = 1e-10  # change of squared distances in a step, over that of the radii,
 _WIDER = 1.05  # bound of the next displacements over the largest one
 _LEAST = 0.25  # distance in the mesh, over the sum of radii, below which bars cross there and do not touch
 _DEEP = 0.2  # overlap over the radius from which results are doubtful
+_GAIN = 0.1  # energy that dampers produce, over the largest that is stored, from which results are doubtful
 _TAG = 7800  # of messages between ranks with nodes of the same pairs
 
 NORMAL, SPRING, VISCOUS, FIRST, SECOND, WIDTH = 0, 3, 6, 7, 8, 9
@@ -626,7 +627,7 @@ class SelfContact:
         self._h, self.room, self.implicit, self._steps = 0.0, 0.0, False, "time.step"
         self.between = ""
         self.dissipated, self.deepest, self.stale = 0.0, 0.0, False
-        self.sums = np.zeros(6)
+        self.sums, self._largest, self._gained = np.zeros(6), 0.0, 0.0
         self._way, self._limit, self._drift, self._most = 0.0, 0.0, np.zeros(3), np.zeros(3)
         self._reference = mesh.points[: mesh.n_owned].copy()
         self._last = self._reference.T.copy()
@@ -738,7 +739,14 @@ class SelfContact:
             f"[self_contact]: bars have overlapped by up to {100.0 * deepest:.0f} % of a radius, as contacts must be "
             "soft for this time.step: a smaller one (time.safety) makes them stiffer"
         )
-        return [text] if deepest > _DEEP else []
+        told = [text] if deepest > _DEEP else []
+        most, gained = self.comm.allreduce(np.array([self._largest, self._gained]))
+        if gained > _GAIN * most:
+            told.append(
+                f"[self_contact]: dampers of bars at walls have produced {gained:.3g} J in some steps, where bars that "
+                f"touch have stored up to {most:.3g} J: a smaller {self._steps} follows their impacts"
+            )
+        return told
 
     def hint(self) -> str:
         """Return what to add to the message about a solve that did not converge. Collective."""
@@ -916,7 +924,9 @@ class SelfContact:
             elif self.at_walls.passed:
                 self.between = self.at_walls.passed.replace(" passes through ", " and ")
             stored += more
-            self.dissipated += lost if commit else 0.0
+            if commit:
+                self.dissipated += lost
+                self._largest, self._gained = max(self._largest, stored), self._gained - min(lost, 0.0)
         return stored, self.dissipated
 
     def pushes(self, x: np.ndarray, weight: float) -> np.ndarray:

@@ -385,7 +385,8 @@ class ImplicitStepper(Stepper):
             guess = back + part * (guess - back)
             supports.put(guess, lacking)
         raise NotConverged(
-            f"{self.when(balance)}: supports would move {touch.between} through each other; {self.remedy}",
+            f"{self.when(balance)}: {'supports' if supports.any else 'the motion'} would move {touch.between} through "
+            f"each other; {self.remedy}",
             "supports move bars through each other",
         )
 

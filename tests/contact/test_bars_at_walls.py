@@ -135,6 +135,22 @@ def test_light_wall_with_mass(comm, shared_tmp_path):
     assert abs(rows[-1]["numerical_dissipation"]) < 1e-3 * 0.5 * MASS
 
 
+@pytest.mark.parametrize("count", [4, 40])
+def test_bar_at_several_walls(count, comm, shared_tmp_path):
+    """They share the stiffness that a step allows: an elastic impact keeps its energy, and dampers take from it."""
+    places = np.linspace(-0.5, 0.5, count).tolist()
+    balls = [{"name": f"w{x}", "type": "sphere", "point": [x, 0.0, 0.415], "radius": 0.1} for x in places]
+    for restitution in (1.0, 0.0):
+        case = falling(BALL, step="auto", end=0.25)
+        case["wall"] = [{**ball, "restitution": restitution} for ball in balls]
+        rows, run = rows_of(case, comm, shared_tmp_path, f"{restitution}")
+        if restitution:
+            np.testing.assert_allclose(run.state.v[:, 2], 1.0, rtol=0.01)
+        else:
+            assert (np.abs(run.state.v[:, 2]) < 0.5).all()
+        assert abs(rows[-1]["numerical_dissipation"]) < 0.06 * 0.5 * MASS
+
+
 @pytest.mark.parallel
 def test_bar_that_starts_in_a_wall_is_refused(comm, shared_tmp_path):
     case = falling(BALL, [[-1.0, 0.0, 0.4], [1.0, 0.0, 0.4]])

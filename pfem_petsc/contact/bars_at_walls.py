@@ -350,7 +350,7 @@ class BarsAtWalls:
             start, end = earlier.rest(k, self._before), poses.rest(k, x)
             most = np.linalg.norm(end - start, axis=1)[ends].max(axis=1, initial=0.0)
             fast = np.flatnonzero((most > _DEEPER * wall.depth) & self._applies[:, i])
-            middle = 0.5 * (start[ends[fast]].sum(axis=1) + end[ends[fast]].sum(axis=1)) / 2.0
+            middle = 0.25 * (start[ends[fast]].sum(axis=1) + end[ends[fast]].sum(axis=1))
             long = np.linalg.norm(start[ends[fast, 1]] - start[ends[fast, 0]], axis=1)
             fast = fast[wall.gaps(middle) < 0.5 * long + most[fast]]
             if not len(fast):

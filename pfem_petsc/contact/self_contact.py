@@ -83,7 +83,7 @@ _STILL = 1e-10  # change of squared distances in a step, over that of the radii,
 _WIDER = 1.05  # bound of the next displacements over the largest one
 _LEAST = 0.25  # distance in the mesh, over the sum of radii, below which bars cross there and do not touch
 _DEEP = 0.2  # overlap over the radius from which results are doubtful
-_GAIN = 0.1  # energy that dampers produce, over the largest that is stored, from which results are doubtful
+_GAIN = 0.1  # energy that dampers produce, over what is stored or dissipated, from which results are doubtful
 _TAG = 7800  # of messages between ranks with nodes of the same pairs
 
 NORMAL, SPRING, VISCOUS, FIRST, SECOND, WIDTH = 0, 3, 6, 7, 8, 9
@@ -627,7 +627,7 @@ class SelfContact:
         self._h, self.room, self.implicit, self._steps = 0.0, 0.0, False, "time.step"
         self.between = ""
         self.dissipated, self.deepest, self.stale = 0.0, 0.0, False
-        self.sums, self._largest, self._gained = np.zeros(6), 0.0, 0.0
+        self.sums, self._at_walls = np.zeros(6), np.zeros(3)  # of the latter: most stored; lost, gained in steps [J]
         self._way, self._limit, self._drift, self._most = 0.0, 0.0, np.zeros(3), np.zeros(3)
         self._reference = mesh.points[: mesh.n_owned].copy()
         self._last = self._reference.T.copy()
@@ -740,11 +740,11 @@ class SelfContact:
             "soft for this time.step: a smaller one (time.safety) makes them stiffer"
         )
         told = [text] if deepest > _DEEP else []
-        most, gained = self.comm.allreduce(np.array([self._largest, self._gained]))
-        if gained > _GAIN * most:
+        most, lost, gained = self.comm.allreduce(self._at_walls)
+        if gained > _GAIN * max(most, lost):
             told.append(
-                f"[self_contact]: dampers of bars at walls have produced {gained:.3g} J in some steps, where bars that "
-                f"touch have stored up to {most:.3g} J: a smaller {self._steps} follows their impacts"
+                f"[self_contact]: dampers of bars at walls have produced {gained:.3g} J in some steps, and dissipated "
+                f"{lost:.3g} J in others: a smaller {self._steps} follows their impacts"
             )
         return told
 
@@ -926,7 +926,7 @@ class SelfContact:
             stored += more
             if commit:
                 self.dissipated += lost
-                self._largest, self._gained = max(self._largest, stored), self._gained - min(lost, 0.0)
+                self._at_walls += max(stored - self._at_walls[0], 0.0), max(lost, 0.0), max(-lost, 0.0)
         return stored, self.dissipated
 
     def pushes(self, x: np.ndarray, weight: float) -> np.ndarray:

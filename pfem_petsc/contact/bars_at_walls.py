@@ -176,30 +176,10 @@ class BarsAtWalls:
         self._near[k] = bars, there.copy()
         return bars
 
-    def _limited(self, k: int, bars: np.ndarray, touched: np.ndarray, before: np.ndarray) -> np.ndarray:
-        """Return the stiffness (m,) of bars at wall k: theirs along the axis, unless an explicit step requires less; of
-        those that have ``touched`` it (m,) what it was ``before`` (m,). Collective if the wall has mass."""
-        stiffness, room = self._model.bars.stiffness[self._bars[bars]], self._model.self_contact.room
-        if not room:
-            return stiffness
-        stiffness = np.minimum(_SHARE * room * self._mass[bars].min(axis=1, initial=np.inf), stiffness)
-        mass = self._wall_mass(k)
-        if mass < np.inf:  # bars that begin to touch share a part of what is left
-            mine = self._counted[bars]
-            sums = np.array([before[mine & touched].sum(), np.count_nonzero(mine & ~touched)])
-            used, fresh = self._mesh.comm.allreduce(sums)
-            left = _PART * max(_SHARE * room * mass - used, 0.0) / max(fresh, 1.0)
-            stiffness = np.minimum(stiffness, np.where(touched, before, left))
-        return stiffness
-
-    def _wall_mass(self, k: int) -> float:
-        """Return the least mass [kg] that wall k has for a push anywhere on it, infinite if it moves as prescribed."""
-        bodies, reach = self._contact.motion.bodies, 0.5 * self._contact.walls[k].width
-        for i in np.flatnonzero(bodies.at == k):
-            motions, inertia = bodies.inertias(i)
-            motions = motions * np.repeat([1.0, reach], 3)
-            return 1.0 / float(np.linalg.eigvalsh(motions.T @ np.linalg.solve(inertia, motions))[-1])
-        return np.inf
+    def _poses(self, time: float) -> tuple[Poses, Poses]:
+        """Return where walls were at the positions that were committed last, and where they are at a time [s]."""
+        poses = self._contact.motion.poses(time)
+        return poses if self._begun is None else self._contact.motion.poses(self._begun), poses
 
     def _touching(
         self, x: np.ndarray, step: float, time: float
@@ -207,8 +187,7 @@ class BarsAtWalls:
         """For each wall that bars touch at x (local, 3) and a time [s], or have touched before, give its index, the
         keys of these bars, their ends (m, 2), and their contacts and motion in the step [s]."""
         contact, bars_here = self._contact, self._mesh.bars[self._bars]
-        poses = contact.motion.poses(time)
-        earlier = poses if self._begun is None else contact.motion.poses(self._begun)
+        earlier, poses = self._poses(time)
         n, places = len(self._bars), []
         for i, k in enumerate(self.walls):
             near = i * n + self._candidates(k, x, poses)
@@ -226,13 +205,8 @@ class BarsAtWalls:
                 bars = keys[at] - i * n
                 ends = bars_here[bars]
                 here = BarContacts(stiffness[at], count[at], self._inverse[bars], memory[at], touched[at])
-                yield (
-                    k,
-                    keys[at],
-                    ends,
-                    here,
-                    BarMotion(x[ends], t[at], gaps[at], self._before[ends], poses, earlier, step),
-                )
+                motion = BarMotion(x[ends], t[at], gaps[at], self._before[ends], poses, earlier, step)
+                yield k, keys[at], ends, here, motion
 
     def _stiffness(self, keys: np.ndarray, touched: np.ndarray, before: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the stiffness (m,) of contacts by their keys, and how many their bars have (m,). Collective.
@@ -323,11 +297,10 @@ class BarsAtWalls:
         """Return the part of the way from positions ``start`` to ``end`` (local, 3) on which no bar here can pass
         through a wall, and the names of the bar and the wall that limit it."""
         contact, poses, ends = self._contact, self._contact.motion.poses(self.time), self._mesh.bars[self._bars]
-        least, limiting = 1.0, ""
+        most, least, limiting = np.linalg.norm(end - start, axis=1)[ends].max(axis=1, initial=0.0), 1.0, ""
         for i, k in enumerate(self.walls):
             wall = contact.walls[k]
             room = _DEEPER * wall.depth
-            most = np.linalg.norm(end - start, axis=1)[ends].max(axis=1, initial=0.0)
             fast = np.flatnonzero((most > room) & self._applies[:, i])
             if len(fast):
                 a, b = poses.rest(k, start)[ends[fast]].swapaxes(0, 1)
@@ -343,8 +316,7 @@ class BarsAtWalls:
         """Return the names of a bar and a wall that have passed through each other on the straight way from the
         positions that were committed last to x (local, 3) at a time [s], empty if none has. Collective."""
         contact, ends, here = self._contact, self._mesh.bars[self._bars], ""
-        poses = contact.motion.poses(time)
-        earlier = poses if self._begun is None else contact.motion.poses(self._begun)
+        earlier, poses = self._poses(time)
         for i, k in enumerate(self.walls):
             wall = contact.walls[k]
             start, end = earlier.rest(k, self._before), poses.rest(k, x)

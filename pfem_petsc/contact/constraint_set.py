@@ -18,10 +18,9 @@ from ..registry import lookup
 from ..tolerances import BEYOND, ON_BOUND
 from .constraints.base import Constraint, ConstraintKeys, ExpectedNodes, SetPart
 from .explicit import Arrivals, impact_square, planes_of, rebound_lift
-from .fixed_rows import TwoNodeRows
 from .friction import FAST, planes_at_rest, sliding
 from .projection import Planes
-from .rows import FreeNodes, RowSet, WallsOfNodes, free_positions, push_nodes
+from .rows import FreeNodes, RowSet, TwoNodeRows, WallsOfNodes, free_positions, push_nodes
 
 if TYPE_CHECKING:
     from ..case.schema import Case

@@ -627,7 +627,8 @@ class SelfContact:
         self._h, self.room, self.implicit, self._steps = 0.0, 0.0, False, "time.step"
         self.between = ""
         self.dissipated, self.deepest, self.stale = 0.0, 0.0, False
-        self.sums, self._at_walls = np.zeros(6), np.zeros(3)  # of the latter: most stored; lost, gained in steps [J]
+        self.sums = np.zeros(6)
+        self._wall_energies = np.zeros(3)  # of bars that touch: most stored at once; lost, and gained, in steps [J]
         self._way, self._limit, self._drift, self._most = 0.0, 0.0, np.zeros(3), np.zeros(3)
         self._reference = mesh.points[: mesh.n_owned].copy()
         self._last = self._reference.T.copy()
@@ -740,7 +741,7 @@ class SelfContact:
             "soft for this time.step: a smaller one (time.safety) makes them stiffer"
         )
         told = [text] if deepest > _DEEP else []
-        most, lost, gained = self.comm.allreduce(self._at_walls)
+        most, lost, gained = self.comm.allreduce(self._wall_energies)
         if gained > _GAIN * max(most, lost):
             told.append(
                 f"[self_contact]: dampers of bars at walls have produced {gained:.3g} J in some steps, and dissipated "
@@ -926,7 +927,7 @@ class SelfContact:
             stored += more
             if commit:
                 self.dissipated += lost
-                self._at_walls += max(stored - self._at_walls[0], 0.0), max(lost, 0.0), max(-lost, 0.0)
+                self._wall_energies += max(stored - self._wall_energies[0], 0.0), max(lost, 0.0), max(-lost, 0.0)
         return stored, self.dissipated
 
     def pushes(self, x: np.ndarray, weight: float) -> np.ndarray:

@@ -13,8 +13,9 @@ import os
 import sys
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, redirect_stderr
 from functools import cache
+from io import StringIO
 from types import FrameType, TracebackType
 from typing import Any, TypeVar
 
@@ -82,7 +83,9 @@ class _Watch:
         atexit.register(self._at_exit)
 
     def _uncaught(self, kind: type[BaseException], error: BaseException, trace: TracebackType | None) -> None:
-        self._tell(kind, error, trace)
+        with redirect_stderr(StringIO()) as told:  # in one piece: ranks that fail together write into one another's lines
+            self._tell(kind, error, trace)
+        print(told.getvalue(), end="", file=sys.stderr, flush=True)
         if not (hasattr(sys, "ps1") or sys.flags.interactive):  # the user goes on
             self._end(1)
 

@@ -675,7 +675,6 @@ class SelfContact:
         static = "newton" if case.static is None else case.static.method
         scheme_name = "" if case.time is None else case.time.integrator
         walls = [] if self.at_walls is None else [repr(self._model.contact.names[k]) for k in self.at_walls.walls]
-        explicit = 'use an explicit integrator, such as time.integrator = "central_differences"'
         conserves = "it conserves energy: use another one, or remove friction and restitution"
         for applies, what, remedy in (
             (static != "newton", f'static.method = "{static}"', 'use "newton"'),
@@ -690,7 +689,6 @@ class SelfContact:
                 f'"{scheme_name}"',
                 "use another integrator",
             ),
-            (self._model.links, "[[contact_pair]] or [[constraint]]", explicit),
             (scheme.discrete_gradient and not self.symmetric, f'time.integrator = "{scheme_name}"', conserves),
         ):
             if applies:

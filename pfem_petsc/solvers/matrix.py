@@ -70,8 +70,8 @@ def _add_lumped(ptr, diagonal, inertia, values):
 class HessianMatrix:
     """Assembled Hessian of the owned rows; one interface to the two ways of setting values in a fixed PETSc pattern.
 
-    ``supports`` are those that :meth:`constrain` takes into account. ``fill(callback)`` zeroes the values, lets the
-    callback add to them, and passes them to PETSc.
+    ``supports`` are those that :meth:`constrain` takes into account; with ``grows`` the pattern can grow, as where bars
+    touch. ``fill(callback)`` zeroes the values, lets the callback add to them, and passes them to PETSc.
 
     Attributes
     ----------
@@ -79,8 +79,10 @@ class HessianMatrix:
     bounded : the matrix of steps with bounds: ``mat``, or M B^-T mat B^-1 with coordinates of rows
     """
 
-    def __init__(self, mesh: DistributedMesh, supports: Supports | None = None, symmetric: bool = True) -> None:
-        self.mesh = mesh
+    def __init__(
+        self, mesh: DistributedMesh, supports: Supports | None = None, symmetric: bool = True, grows: bool = False
+    ) -> None:
+        self.mesh, self._grows = mesh, grows
         local, total = 3 * mesh.n_owned, 3 * mesh.n_nodes
         self.mat = PETSc.Mat().create(comm=mesh.comm)
         self.mat.setSizes(((local, total), (local, total)), bsize=3)
@@ -93,7 +95,8 @@ class HessianMatrix:
         self.mat.setOption(PETSc.Mat.Option.SYMMETRIC, symmetric)
         self.bounded = self.mat
         self._rows: RowCoordinates | None = None
-        self._made: list[PETSc.Mat] = []  # of these: B^-1, B^-T mat B^-1, then M and the product of both, if rows rub
+        # of these: B^-1, B^-T mat B^-1, then M and the product of both, if rows rub, and a copy, if the pattern grows
+        self._made: list[PETSc.Mat] = []
         self._symmetric = symmetric
         self._held = None if supports is None or not supports.any else supports.spans()  # projections of owned nodes
         if self._held is not None:
@@ -126,6 +129,8 @@ class HessianMatrix:
         if self.mesh.comm.allreduce(not np.array_equal(coupled, self._coupled), op=MPI.LOR):
             self._coupled = coupled
             self._allocate()
+            if self._rows is not None:
+                self._multiply()
 
     @cached_property
     def local_columns(self) -> np.ndarray:
@@ -154,16 +159,26 @@ class HessianMatrix:
         """Set the coordinates of rows for steps with bounds, instead of those set before. Collective."""
         self._free_made()
         self._rows = rows
-        if rows is None:
-            return
-        inverse = rows.matrix()
+        if rows is not None:
+            self._multiply()
+            self.bounded.setOption(PETSc.Mat.Option.SYMMETRIC, self._symmetric and rows.relative is None)
+
+    def _multiply(self) -> None:
+        """Make the matrices of the coordinates of rows, with the pattern of ``mat``. Collective."""
+        copy = self._made.pop() if self._grows and self._made else None  # solvers keep it
+        self._free_made()
+        inverse = self._rows.matrix()
         self.fill(lambda values: None)
         self._made = [inverse, self.mat.ptap(inverse)]
-        if rows.relative is not None:
+        if self._rows.relative is not None:
             maps = block_diagonal(self.mesh)
             self._made += [maps, maps.matMult(self._made[1])]
+        if copy is not None:
+            copy.setPreallocationCSR(self._made[-1].getValuesCSR())
+        elif self._grows:
+            copy = self._made[-1].duplicate()
+        self._made += [copy] if self._grows else []
         self.bounded = self._made[-1]
-        self.bounded.setOption(PETSc.Mat.Option.SYMMETRIC, self._symmetric and rows.relative is None)
 
     def _turn(self, transform: Transform, values: np.ndarray) -> None:
         """Transform the values to the coordinates of frames of nodes without rows."""
@@ -219,19 +234,21 @@ class HessianMatrix:
         if self._rows is None:
             return
         inverse, product, *maps = self._made
+        result = product
         if transform.rows is None:
             self.mat.copy(self.bounded, PETSc.Mat.Structure.DIFFERENT)
             return
         if self._rows.varies:
             self._rows.refresh(inverse)
         self.mat.ptap(inverse, product)
-        if maps and transform.slides:
-            self._let_slide(transform, product, maps[0])
-        elif maps:
-            product.copy(self.bounded, PETSc.Mat.Structure.DIFFERENT)
+        if self._rows.relative is not None and transform.slides:
+            result = maps[1]
+            self._let_slide(transform, product, maps[0], result)
+        if result is not self.bounded:
+            result.copy(self.bounded, PETSc.Mat.Structure.DIFFERENT)
 
-    def _let_slide(self, transform: Transform, product: PETSc.Mat, maps: PETSc.Mat) -> None:
-        """Compute ``bounded`` from B^-T mat B^-1: add the turning of slips, and multiply by M. Collective."""
+    def _let_slide(self, transform: Transform, product: PETSc.Mat, maps: PETSc.Mat, result: PETSc.Mat) -> None:
+        """Compute the result from B^-T mat B^-1: add the turning of slips, and multiply by M. Collective."""
         nodes = transform.sliding.nodes
         turning, left = transform.slip_blocks(), transform.left()
         if self._held is not None:  # whose rows and columns remain those of the identity
@@ -242,7 +259,7 @@ class HessianMatrix:
         every = np.tile(np.eye(3), (self.mesh.n_owned, 1, 1))
         every[nodes] = left
         add_diagonal(maps, self.mesh, np.arange(self.mesh.n_owned), every, PETSc.InsertMode.INSERT_VALUES)
-        maps.matMult(product, self.bounded)
+        maps.matMult(product, result)
 
     def fill_held(self, problem: StepProblem, held: np.ndarray, stored: np.ndarray | None) -> PETSc.Mat:
         """Assemble as :meth:`add`, in the coordinates of the problem; rows and columns of components (owned, 3) with

@@ -189,7 +189,7 @@ class ImplicitStepper(Stepper):
         if choice.matrix_free:
             self.hessian = MatrixFreeHessian(model)
         else:
-            self.hessian = HessianMatrix(model.mesh, model.supports, symmetric)
+            self.hessian = HessianMatrix(model.mesh, model.supports, symmetric, touch is not None)
         self.lagged = None
         if choice.lagged:
             self.lagged = LaggedPreconditioner(

@@ -522,6 +522,86 @@ def test_bars_between_walls_in_any_direction(friction, comm, shared_tmp_path):
         np.testing.assert_allclose(column(others, key), values, atol=1e-7 * values.max())
 
 
+def on_a_pair(friction, turn=np.eye(3), **tables):
+    """A bar flies onto another, whose nodes meet those of a third one."""
+    points = np.array(
+        [[-0.5, 0, 0], [0.5, 0, 0], [-0.1, -0.5, 0.0202], [0.2, 0.5, 0.0202], [-0.5, 0, -0.0301], [0.5, 0, -0.0301]]
+    )
+    pair = {"name": "faces", "first": "lower", "second": "middle", "direction": turn[:, 2].tolist(), "gap": 0.03}
+    motion = (
+        {}
+        if "static" in tables
+        else {
+            "initial": {"on": [{"node_set": "upper", "velocity": (turn @ [0.3, 0.0, -2.0]).tolist()}]},
+            "time": {"integrator": "generalized_alpha", "step": 1e-5, "end": 2e-3},
+        }
+    )
+    sets = {name: {"indices": [2 * i, 2 * i + 1]} for i, name in enumerate(("middle", "upper", "lower"))}
+    contact = {"self_contact": {"friction": friction}, "contact_pair": [pair | {"friction": friction}]}
+    motion["solver"] = {"rtol": 1e-12}
+    return case_of(points @ turn.T, [[0, 1], [2, 3], [4, 5]], **{"node_set": sets, **motion, **contact} | tables)
+
+
+@pytest.mark.parallel
+@pytest.mark.parametrize("friction", [0.0, 0.3])
+def test_bars_that_touch_beside_pairs(friction, comm, shared_tmp_path):
+    """As in explicit steps; the same turned and on one rank; momentum is kept. The matrix in the coordinates of pairs
+    gets the entries of bars that begin to touch."""
+    explicit = {"integrator": "central_differences", "step": 1e-6, "end": 2e-3}
+    _, expected = rows_of(on_a_pair(friction, time=explicit), comm, shared_tmp_path, "explicit")
+    rows, x = rows_of(on_a_pair(friction), comm, shared_tmp_path, "straight")
+    _, y = rows_of(on_a_pair(friction, TURN), comm, shared_tmp_path, "oblique")
+    _, z = rows_of(on_a_pair(friction), MPI.COMM_SELF, shared_tmp_path, f"one{comm.rank}")
+    if comm.rank == 0:
+        np.testing.assert_allclose(x, expected, atol=1e-5)  # of 4e-3
+        np.testing.assert_allclose(y @ TURN, x, atol=1e-10)
+        np.testing.assert_allclose(z, x, atol=1e-10)
+    assert column(rows, "self_contact/contacts").max() == 1 and column(rows, "newton_iterations").max() <= 4
+    assert np.abs(column(rows, "pair/faces/force")).max() > 1000.0
+    momentum = column(rows, "momentum")
+    np.testing.assert_allclose(momentum, np.tile(momentum[0], (len(momentum), 1)), atol=1e-13 * np.abs(momentum).max())
+
+
+@pytest.mark.slow
+@pytest.mark.parallel
+def test_a_restart_beside_pairs_continues_to_the_bit(comm, shared_tmp_path):
+    whole = rows_of(on_a_pair(0.3), comm, shared_tmp_path, "whole")
+    step = int(np.argmax(column(whole[0], "self_contact/contacts") > 0)) + 3
+    output = {"checkpoint_every": step, "history_every": 1, "fields_every": 0}
+    part = {"integrator": "generalized_alpha", "step": 1e-5, "end": (step + 0.5) * 1e-5}
+    rows_of(on_a_pair(0.3, output=output, time=part), comm, shared_tmp_path, "part")
+    again = rows_of(on_a_pair(0.3, output=output), comm, shared_tmp_path, "part", restart=True)
+    check_restart(whole, again, comm)
+
+
+@pytest.mark.parallel
+def test_static_contact_and_pairs_in_series(comm, shared_tmp_path):
+    """A bar is lowered onto one that presses on a third by pairs, on springs: their stiffnesses are in series."""
+    lowered, spring = 1e-3, 4e5
+    down = {"motion": [[0.0, 0.0, 0.0, 0.0], [1.0, 0.0, 0.0, -lowered]], "interpolation": "linear"}
+    case = on_a_pair(
+        0.0,
+        static={"method": "newton", "step": 0.25},
+        support=[
+            {"node_set": "upper", "fix": "xyz"} | down,
+            {"node_set": "middle", "fix": "xy"},
+            {"node_set": "lower", "fix": "xy"},
+        ],
+        spring=[
+            {"node_set": "lower", "stiffness": [0.0, 0.0, spring]},
+            {"node_set": "middle", "stiffness": [0.0, 0.0, 1e-3]},
+        ],
+    )
+    rows, x = rows_of(case, comm, shared_tmp_path, "static")
+    if comm.rank == 0:
+        np.testing.assert_allclose(x[:2, 2] - x[4:, 2], 0.03, atol=1e-12)
+        force = spring * (-0.0301 - x[4:, 2])
+        assert rows[-1]["self_contact/force"] == pytest.approx(float(force.sum()), rel=1e-6)
+    # gaps of 0.2 and 0.1 mm close; the bars touch at 0.55 of the lower one, which bends the springs unevenly
+    soft = (1.0 + np.hypot(1.0, 0.3)) / (2.0 * YOUNG * AREA) + (0.45**2 + 0.55**2) / spring
+    assert rows[-1]["self_contact/force"] == pytest.approx((lowered - 0.0003) / soft, rel=1e-3)
+
+
 @pytest.mark.parallel
 def test_supports_in_any_direction(comm, shared_tmp_path):
     """Also along none of the axes, whose rows and columns the derivatives do not have."""

@@ -187,8 +187,6 @@ def draw_bars_touch(chance: random.Random, case: dict[str, Any], body: Body, mot
     explicit, scheme = case["time"]["integrator"] in EXPLICIT, case["time"]["integrator"]
     if "mass" in case["time"] or _treatment(case) == "mass_redistribution":
         return
-    if not explicit and (case.get("contact_pair") or case.get("constraint")):
-        return
     if scheme == "energy_momentum" and any(w["type"] not in ("plane", "rectangle") for w in case.get("wall", ())):
         return  # which bars could cross between their nodes
     if not explicit:

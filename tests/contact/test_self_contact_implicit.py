@@ -522,7 +522,10 @@ def test_bars_between_walls_in_any_direction(friction, comm, shared_tmp_path):
         np.testing.assert_allclose(column(others, key), values, atol=1e-7 * values.max())
 
 
-def on_a_pair(friction, turn=np.eye(3), **tables):
+STRAIGHT = np.eye(3)
+
+
+def on_a_pair(friction, turn=STRAIGHT, **tables):
     """A bar flies onto another, whose nodes meet those of a third one."""
     points = np.array(
         [[-0.5, 0, 0], [0.5, 0, 0], [-0.1, -0.5, 0.0202], [0.2, 0.5, 0.0202], [-0.5, 0, -0.0301], [0.5, 0, -0.0301]]

@@ -11,13 +11,16 @@ force Coulomb's law limits, friction, as between bars (:mod:`~pfem_petsc.contact
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from math import acosh, asin, exp, pi, sqrt, tan
+from math import sqrt
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 from ..errors import InputError
+from ..mechanics.compiled import kernel
 from ..tolerances import BEYOND
+from .bar_springs import CRITICAL, PairLaw, damp, damping_of, slide
+from .rotations import dot, put, times, vector
 from .wall_motion import Poses
 
 if TYPE_CHECKING:
@@ -25,7 +28,6 @@ if TYPE_CHECKING:
 
 _SHARE = 0.2  # of the lighter node's mass over the square of the step, and of what this leaves, that is the stiffness
 _PART = 0.1  # of the stiffness that a wall with mass may still have, for the bars that begin to touch it in a step
-_CRITICAL = exp(-2.0)  # restitution of a damper with which nothing swings back; walls with less get it
 _BESIDE = 1e-7  # part of the length at which normals beside the place are taken
 _NEXT_TO = 1e-6  # way by which positions differ for derivatives, over the length of a bar
 _MIDDLE = 0.45  # of the thickness of a sheet, from which bars have passed it
@@ -37,28 +39,6 @@ SPRING, NORMAL, FORCE, MOMENT, PLACE, DAMPER, STIFFNESS, WIDTH = 0, 3, 6, 9, 12,
 """Columns of the memory of a bar at a wall: elastic part of the slip [m]; normal; force on the bar [N], and its moment
 about the origin [N m]; where it acts, from 0 to 1 along the bar; the part of the damper along the normal [N]; and the
 stiffness [N/m]."""
-
-
-def restitution_of(damping: float) -> float:
-    """Return the ratio of velocities after and before an impact on a spring and a damper that never pull.
-
-    Source: Schwager and Pöschel, Granular Matter 9 (2007), 465, in terms of the damping ratio.
-    """
-    if damping < 1.0:
-        angle = asin(damping)
-        return exp(-tan(angle) * (pi - 2.0 * angle))
-    if damping == 1.0:
-        return exp(-2.0)
-    return exp(-2.0 * damping / sqrt(damping * damping - 1.0) * acosh(damping))
-
-
-def damping_of(restitution: float) -> float:
-    """Return the damping ratio for :func:`restitution_of`, by bisection."""
-    low, high = 0.0, 1e3
-    for _ in range(100):
-        middle = 0.5 * (low + high)
-        low, high = (middle, high) if restitution_of(middle) > restitution else (low, middle)
-    return 0.5 * (low + high) if restitution < 1.0 else 0.0
 
 
 def small_walls(walls: Sequence[BaseWall]) -> list[int]:
@@ -112,6 +92,28 @@ class Response(NamedTuple):
     stored: np.ndarray
     lost: np.ndarray
     memory: np.ndarray
+
+
+@kernel
+def resist(law, here, push, slip, mobility, normals):
+    """Return the forces along the normals (m,) of springs that ``push`` (m,) [N] with their dampers, elastic slips
+    (m, 3) [m], and the energies (m,) [J] that both lose as bars ``slip`` (m, 3) [m] in a step.
+
+    ``law``: PairLaw; ``here``: BarContacts; ``mobility`` (m,) [1/kg]; ``normals`` (m, 3). The force of a damper by the
+    velocity at the end of a step also changes with those of the other walls that the bar touches.
+    """
+    total, end, lost = push.copy(), np.zeros(slip.shape), np.zeros(len(push))
+    for p in range(len(push)):
+        n, way, k, old = vector(normals, p), vector(slip, p), here.stiffness[p], here.memory[p]
+        if push[p] > 0.0 and (law.lead > 0.0 or here.touched[p]):
+            shared = PairLaw(law.friction, law.damping, law.step, law.way, law.base, law.lead * here.count[p])
+            total[p] = damp(push[p], k, dot(n, way), mobility[p], shared, np.inf)
+        size, spring = max(sqrt(dot(n, n)), 1e-300), (old[SPRING], old[SPRING + 1], old[SPRING + 2])
+        stop, _, lost[p] = slide(spring, k, law.friction * total[p] / max(k, 1e-300), way, times(1.0 / size, n))
+        put(end, p, stop)
+        before = (old[NORMAL], old[NORMAL + 1], old[NORMAL + 2])
+        lost[p] -= 0.5 * ((total[p] - push[p]) * dot(n, way) + old[DAMPER] * dot(before, way))
+    return total, end, lost
 
 
 class BarsAtWalls:
@@ -391,7 +393,7 @@ class BarsAtWalls:
 
     def _respond(self, k: int, here: BarContacts, motion: BarMotion) -> Response:
         """Return what wall k does to bars."""
-        wall, friction = self._contact.walls[k], self._contact.friction[self._contact.first[k]]
+        wall = self._contact.walls[k]
         gaps, touch = motion.gaps, motion.gaps < 0.0
         t = np.where(touch, motion.t, here.memory[:, PLACE])
         normals = motion.poses.turned(k, _normals(wall, motion.poses.rest(k, motion.x), t))
@@ -400,26 +402,15 @@ class BarsAtWalls:
         slip = point - start - motion.earlier.ways(motion.poses, start)[:, k]
         stiffness, push = here.stiffness, np.where(touch, -here.stiffness * gaps, 0.0)
         mobility = (weights**2 * here.inverse).sum(axis=1) + self._wall_mobility(k, point, normals)
-        total = self._damped(k, here, (push, np.einsum("mi,mi->m", normals, slip), mobility), motion.step)
-        # friction: an elastic slip, turned into the plane across the normal, up to what Coulomb's law allows
-        unit = normals / np.maximum(np.linalg.norm(normals, axis=1), 1e-300)[:, None]
-        old = here.memory[:, SPRING : SPRING + 3]
-        flat, flat_slip = (v - np.einsum("mi,mi->m", v, unit)[:, None] * unit for v in (old, slip))
-        length, left = np.linalg.norm(old, axis=1), np.linalg.norm(flat, axis=1)
-        flat *= np.where(left > 0.0, length / np.maximum(left, 1e-300), 0.0)[:, None]
-        trial = flat + flat_slip
-        size, most = np.linalg.norm(trial, axis=1), friction * total / np.maximum(stiffness, 1e-300)
-        end = trial * np.where(size > most, most / np.maximum(size, 1e-300), 1.0)[:, None]
+        law = self._law(k, motion.step)
+        total, end, lost = resist(law, here, push, slip, mobility, normals)
         force = total[:, None] * normals - stiffness[:, None] * end
-        rubbed = 0.5 * stiffness * np.einsum("mi,mi->m", flat + end, trial - end)
-        damper, before = total - push, here.memory[:, NORMAL : NORMAL + 3]
-        damping = damper[:, None] * normals + here.memory[:, DAMPER, None] * before
-        lost = rubbed - 0.5 * np.einsum("mi,mi->m", damping, slip)
+        before = here.memory[:, NORMAL : NORMAL + 3]
         passed = touch & here.touched & (np.einsum("mi,mi->m", before, normals) < 0.0)
         if wall.thickness is not None:  # beyond the middle of a sheet nothing pushes bars back
             passed |= gaps < -_MIDDLE * wall.thickness
         stored = np.where(touch, 0.5 * stiffness * (gaps**2 + np.einsum("mi,mi->m", end, end)), 0.0)
-        memory = np.column_stack([end, normals, force, np.cross(point, force), t, damper, stiffness])
+        memory = np.column_stack([end, normals, force, np.cross(point, force), t, total - push, stiffness])
         return Response(touch, passed, weights[:, :, None] * force[:, None, :], stored, lost, memory)
 
     def _wall_mobility(self, k: int, point: np.ndarray, normals: np.ndarray) -> np.ndarray | float:
@@ -431,23 +422,14 @@ class BarsAtWalls:
             return (given * np.linalg.solve(inertia, given)).sum(axis=0)
         return 0.0
 
-    def _damped(
-        self, k: int, here: BarContacts, spring: tuple[np.ndarray, np.ndarray, np.ndarray], step: float
-    ) -> np.ndarray:
-        """Return the forces (m,) of springs with a damper, which pull never [N], from ``push``, closing way and
-        mobility (m,) of each ``spring``; in explicit steps the velocity is that at the end of the step, half a step
-        later, by the force itself and those of the other walls that the bar touches. In steps that solve equations,
-        which had no solution if a force jumped, dampers of bars that begin to touch follow a step later."""
-        restitution = float(self._contact.restitution[self._contact.first[k]])
-        push, closing, mobility = spring
-        if restitution >= 1.0 or step <= 0.0:
-            return push
-        implicit = self._model.self_contact.implicit
-        ratio = 2.0 * damping_of(max(restitution, _CRITICAL))
-        drag = ratio * np.sqrt(here.stiffness / np.maximum(mobility, 1e-300)) * (mobility > 0.0)
-        lead = 0.0 if implicit else 0.5 * here.count
-        total = (push - drag * closing / step) / (1.0 + lead * drag * step * mobility)
-        return np.where(push > 0.0 if not implicit else here.touched & (push > 0.0), np.maximum(total, 0.0), push)
+    def _law(self, k: int, step: float) -> PairLaw:
+        """Return the law of contacts with wall k in a step [s]. In explicit steps dampers take the velocity at the end
+        of the step, half a step later; in steps that solve equations they follow a step later where bars begin to
+        touch."""
+        slot = self._contact.first[k]
+        restitution, friction = (float(each[slot]) for each in (self._contact.restitution, self._contact.friction))
+        lead = 0.0 if self._model.self_contact.implicit else 0.5
+        return PairLaw(friction, damping_of(max(restitution, CRITICAL)), step, 0.0, 0.0, lead)
 
 
 def _normals(wall: BaseWall, ends: np.ndarray, t: np.ndarray) -> np.ndarray:

@@ -47,8 +47,9 @@ from ..mesh.slab import slab_of, slab_range
 from ..output.units import engineering
 from ..parallel.agreement import agreed
 from ..parallel.natural import NaturalOrder
+from .bar_springs import PairLaw, damp, damping_of, slide
 from .bars_at_walls import WIDTH as BAR_WIDTH
-from .bars_at_walls import BarsAtWalls, damping_of
+from .bars_at_walls import BarsAtWalls
 from .neighbours import (
     Points,
     Segments,
@@ -126,19 +127,6 @@ class NodeArrays(NamedTuple):
     force: np.ndarray
 
 
-class PairLaw(NamedTuple):
-    """Coulomb's coefficient of friction; damping ratio; the step [s]; the way of the nodes so far, and that from which
-    they have come to where pairs may sleep [m], the same unless forces are only tried; how many steps later than the
-    mean velocity of the step that of the damper is."""
-
-    friction: float
-    damping: float
-    step: float
-    way: float
-    base: float
-    lead: float = 0.5
-
-
 Look = tuple[NodeArrays | None, np.ndarray | None, PairLaw]
 
 ENERGY, DISSIPATED, CONTACTS, OVERLAP, FORCE, DEPTH = range(6)
@@ -204,32 +192,6 @@ def _repel(pairs, p, x, s, t, g):
             add_to(g, i, slope * (2.0 * i - 1.0), along(v, -uv / uu, u))
             add_to(g, 2 + i, slope * (2.0 * i - 1.0), along(u, -uv / vv, v))
     return energy, push, at, other
-
-
-@inlined
-def _damp(pairs, p, law, push, closing, mobility):
-    """Return the normal force of spring and damper, which pulls never [N]; ``closing`` is the change of the distance in
-    the step. The velocity is that at the end of an explicit step, half a step later, by the force itself."""
-    if law.damping <= 0.0 or law.step <= 0.0 or mobility.real <= 0.0:
-        return push
-    drag = 2.0 * law.damping * np.sqrt(pairs.stiffness[p] / mobility)
-    if drag.real > pairs.drag[p]:
-        drag = pairs.drag[p]
-    total = (push - drag * closing / law.step) / (1.0 + law.lead * drag * law.step * mobility)
-    return total if total.real > 0.0 else 0.0
-
-
-@inlined
-def _slide(spring, k, most, way, normal):
-    """Return the elastic slip of a pair, at ``most`` as given [m], after a ``way`` of its points; the energy stored,
-    and that dissipated."""
-    flat = along(spring, -dot(spring, normal), normal)
-    left = dot(flat, flat)  # turned into the plane across the normal
-    start = times(np.sqrt(dot(spring, spring) / left) if left.real > 0.0 else 0.0, flat)
-    trial = along(along(start, 1.0, way), -dot(way, normal), normal)
-    square = dot(trial, trial)
-    end = times(most / np.sqrt(square) if square.real > (most * most).real else 1.0, trial)
-    return end, 0.5 * k * dot(end, end), 0.5 * k * dot(along(start, 1.0, end), minus(trial, end))
 
 
 @inlined
@@ -323,12 +285,12 @@ def evaluate_pairs(pairs, state, old, new, nodes, law, out):
         total = push
         if law.lead > 0.0 or state[p] == TOUCHING:
             # the damper of a pair that begins to touch would jump: a step that ends just there had no solution
-            total = _damp(pairs, p, law, push, closing, mobility)
+            total = damp(push, k, closing, mobility, law, pairs.drag[p])
         lost -= 0.5 * (old[p, VISCOUS] + total - push) * closing
         if total != push:
             _gradient(g, s, t, times(total - push, normal))
         if law.friction > 0.0:
-            end, held, rubbed = _slide(vector(old[:, SPRING:], p), k, law.friction * total / k, way, normal)
+            end, held, rubbed = slide(vector(old[:, SPRING:], p), k, law.friction * total / k, way, normal)
             lost += rubbed
             _gradient(g, s, t, times(-k, end))
         state[p] = TOUCHING

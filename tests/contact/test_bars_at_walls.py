@@ -7,7 +7,7 @@ from helpers.stopped import assert_as_on_one_rank, assert_restart_is_bitwise
 from helpers.triangles import box, write_surface
 
 from pfem_petsc import Case, InputError, SimulationFailure
-from pfem_petsc.contact.bars_at_walls import damping_of
+from pfem_petsc.contact.bar_springs import damping_of
 
 BALL = {"type": "sphere", "point": [0.0, 0.0, 0.0], "radius": 0.5}
 ACROSS = [[-1.0, 0.0, 0.52], [1.0, 0.0, 0.52]]

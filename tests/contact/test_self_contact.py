@@ -5,7 +5,7 @@ import pytest
 from mpi4py import MPI
 
 from pfem_petsc import Case, Simulation, Truss, open_result
-from pfem_petsc.contact.bars_at_walls import damping_of, restitution_of
+from pfem_petsc.contact.bar_springs import PairLaw, damping_of, restitution_of
 from pfem_petsc.contact.neighbours import segment_distance
 from pfem_petsc.contact.self_contact import (
     DISSIPATED,
@@ -14,7 +14,6 @@ from pfem_petsc.contact.self_contact import (
     WIDTH,
     NodeArrays,
     PairArrays,
-    PairLaw,
     evaluate_pairs,
     find_beginning,
 )

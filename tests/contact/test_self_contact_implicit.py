@@ -5,6 +5,7 @@ import pytest
 from mpi4py import MPI
 
 from pfem_petsc import Case, Simulation, Truss
+from pfem_petsc.contact.bar_springs import PairLaw
 from pfem_petsc.contact.neighbours import segment_distance
 from pfem_petsc.contact.self_contact import (
     NORMAL,
@@ -12,7 +13,6 @@ from pfem_petsc.contact.self_contact import (
     WIDTH,
     NodeArrays,
     PairArrays,
-    PairLaw,
     add_step_gradients,
     differentiate_pairs,
     evaluate_pairs,

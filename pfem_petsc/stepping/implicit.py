@@ -356,7 +356,8 @@ class ImplicitStepper(Stepper):
             if settled:
                 break
             guess = u
-        if not active_set.candidates.anywhere and not model.supports.any and model.bars.springs is None:
+        free = not model.supports.any and model.bars.springs is None and self.scheme.inertial
+        if free and not active_set.candidates.anywhere:
             self._keep_momentum(problem, u, g)
         state.contact, walls, self.held = active_set.forces(u)
         held = model.links.count_held(np.flatnonzero(self.held))

@@ -238,3 +238,20 @@ def test_wall_rubs_a_bar_on_springs(comm, shared_tmp_path):
     assert max(abs(row["energy_imbalance"]) for row in rows) < 1e-12
     stuck = [row["self_contact_dissipation"] for row in rows if row["load_factor"] <= 0.5]
     assert max(stuck) < 1e-12
+
+
+@pytest.mark.parallel
+@pytest.mark.parametrize("clear", [0.0, 1e-4])
+def test_friction_alone_holds_a_bar(clear, comm, shared_tmp_path):
+    """Statics: a bar on two cylinders, that no support nor spring holds, presses each with half of its weight."""
+    case = at_rest({**CYLINDER, "radius": 0.1, "friction": 0.5})
+    (wall,) = case["wall"]
+    case["wall"] = [{**wall, "name": f"w{k}", "point": [x, 0.0, 0.42 - clear]} for k, x in enumerate((-0.5, 0.5))]
+    case["gravity"] = {"acceleration": [0.0, 0.0, -9.81]}
+    case["static"]["step"] = 0.25
+    del case["spring"]
+    rows, run = rows_of(case, comm, shared_tmp_path)
+    for k in range(2):
+        force = [0.0, 0.0, 0.5 * MASS * 9.81]
+        np.testing.assert_allclose(rows[-1][f"wall/w{k}/force"], force, rtol=1e-9, atol=1e-9)
+    assert abs(rows[-1]["energy_imbalance"]) < 1e-9

@@ -514,6 +514,12 @@ class StaticStepper(ImplicitStepper):
                 others = f"walls without friction do not hold nodes along them: add supports; {others}"
             elif model.contact.any:
                 cause += ", or the friction of walls does not hold it"
+        touch = model.self_contact
+        if touch is not None and touch.between:
+            cause = (
+                f"{touch.between} would pass through each other, as no contact bears more than its stiffness times the "
+                f"radius or half the thickness; or {cause}"
+            )
         # smaller increments have been tried
         attempt = re.sub(rf"[.;] {re.escape(self.remedy)}", "", str(failure), flags=re.IGNORECASE)
         return SimulationFailure(

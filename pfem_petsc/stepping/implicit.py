@@ -32,6 +32,7 @@ if TYPE_CHECKING:
     from .model import Model
 
 
+_WITHIN = 0.99  # of the way that is free, so that rounding does not make that shorter again
 _APPROACHES = 5  # guesses, of which only supports move bars through others in the last
 _HALVINGS = 10  # most halvings of a step: to 1/1024
 
@@ -383,7 +384,7 @@ class ImplicitStepper(Stepper):
             part = touch.free_part(start, self.with_ghosts(balance.predictor + guess))
             if part == 1.0:
                 return guess
-            guess = back + part * (guess - back)
+            guess = back + _WITHIN * part * (guess - back)
             supports.put(guess, lacking)
         raise NotConverged(
             f"{self.when(balance)}: {'supports' if supports.any else 'the motion'} would move {touch.between} through "

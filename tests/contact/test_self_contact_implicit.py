@@ -122,6 +122,7 @@ def test_iterations_end_before_bars_pass_through_each_other():
         if part < 1.0:  # where it ends, the bars are close
             limited += 1
             assert distances[-1] < 0.2 * min(start, REACH)
+            assert free_part(pairs, x, 0.99 * part * way) == (1, 0)  # whatever rounding does at the end
     assert limited > 2
     # along each other they are free, however far
     cross = dict(branches())["cross"]

@@ -90,7 +90,7 @@ def compare(name: str, values: list[float], by_hand: list[float], close: list[fl
 
 
 def numbers(printed: str, *names: str) -> list[float]:
-    return [float(re.search(rf"^{name}(?: [a-z]+)? +(-?[\d.e+-]+)", printed, flags=re.MULTILINE)[1]) for name in names]
+    return [float(re.search(rf"^ *{name}(?: [a-z]+)? +(-?[\d.e+-]+)", printed, flags=re.MULTILINE)[1]) for name in names]
 
 
 def test_every_recipe_is_listed_and_has_figures():
@@ -132,7 +132,7 @@ def test_net(cook):
 def test_crush(cook):
     printed = cook("Crush test")
     peak, plateau = numbers(printed, "first peak", r"plateau stress \(20 to 40 %\)")
-    mass = float(re.search(r"^mass +([\d.]+) kg", printed, flags=re.MULTILINE)[1])
+    mass = float(re.search(r"^ *mass +([\d.]+) kg", printed, flags=re.MULTILINE)[1])
     density = mass / 2700.0 / (0.02 * 0.02 * 0.03)
     compare("Crush test", [peak, plateau], [density * 200.0 / 3.0] * 2, [0.15, 0.15])
     assert f"{density:.4f} ·" in RECIPES["Crush test"]

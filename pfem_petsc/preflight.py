@@ -350,7 +350,7 @@ def narrow_walls(model: Model) -> list[str]:
         if touch is not None and contact.walls[k].solid:  # which these bars touch between their nodes
             near &= ~touch.chosen
         elif touch is not None:
-            other = ', or a thickness, of surfaces with side = "both", which bars that touch do not pass'
+            other = ", or triangles with a thickness instead, which bars that touch do not pass"
         longest = model.comm.allreduce(float(model.bars.mesh_lengths[near].max(initial=0.0)), op=MPI.MAX)
         width = contact.walls[k].width
         if width < _OPENING * longest:

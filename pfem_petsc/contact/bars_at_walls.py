@@ -173,7 +173,7 @@ class BarsAtWalls:
             if np.abs(there - before).max(initial=0.0) * sqrt(3.0) < 0.5 * self._skin:
                 return bars
         a, b = there[self._mesh.bars[self._bars]].swapaxes(0, 1)
-        near = self._contact.walls[k].body.gaps(0.5 * (a + b)) < 0.5 * np.linalg.norm(b - a, axis=1) + self._skin
+        near = self._contact.walls[k].gaps(0.5 * (a + b)) < 0.5 * np.linalg.norm(b - a, axis=1) + self._skin
         bars = np.flatnonzero(near & self._applies[:, self.walls.index(k)])
         self._near[k] = bars, there.copy()
         return bars
@@ -194,7 +194,7 @@ class BarsAtWalls:
         for i, k in enumerate(self.walls):
             near = i * n + self._candidates(k, x, poses)
             keys = np.union1d(near, self._keys[self._keys // max(n, 1) == i])
-            t, gaps = contact.walls[k].body.deepest(poses.rest(k, x[bars_here[keys - i * n]]))
+            t, gaps = contact.walls[k].deepest(poses.rest(k, x[bars_here[keys - i * n]]))
             found = (gaps < 0.0) | np.isin(keys, self._keys)
             places.append((keys[found], t[found], gaps[found]))
         keys, t, gaps = (np.concatenate(parts) for parts in zip(*places, strict=True))
@@ -286,7 +286,7 @@ class BarsAtWalls:
             m, size = len(ends), _NEXT_TO * np.linalg.norm(motion.x[:, 1] - motion.x[:, 0], axis=1)
             moves = np.concatenate([np.eye(6), -np.eye(6)]).reshape(12, 1, 2, 3) * size[:, None, None]
             x = (motion.x + moves).reshape(-1, 2, 3)
-            t, gaps = self._contact.walls[k].body.deepest(motion.poses.rest(k, x))
+            t, gaps = self._contact.walls[k].deepest(motion.poses.rest(k, x))
             tried = motion._replace(x=x, t=t, gaps=gaps, before=np.tile(motion.before, (12, 1, 1)))
             copies = BarContacts(*(np.tile(array, (12, *(array.ndim - 1) * [1])) for array in here))
             forces = self._respond(k, copies, tried).force.reshape(2, 6, m, 6)
@@ -301,7 +301,7 @@ class BarsAtWalls:
         contact, poses, ends = self._contact, self._contact.motion.poses(self.time), self._mesh.bars[self._bars]
         most, least, limiting = np.linalg.norm(end - start, axis=1)[ends].max(axis=1, initial=0.0), 1.0, ""
         for i, k in enumerate(self.walls):
-            wall = contact.walls[k].body
+            wall = contact.walls[k]
             room = _DEEPER * wall.depth
             fast = np.flatnonzero((most > room) & self._applies[:, i])
             if len(fast):
@@ -320,7 +320,7 @@ class BarsAtWalls:
         contact, ends, here = self._contact, self._mesh.bars[self._bars], ""
         earlier, poses = self._poses(time)
         for i, k in enumerate(self.walls):
-            wall = contact.walls[k].body
+            wall = contact.walls[k]
             start, end = earlier.rest(k, self._before), poses.rest(k, x)
             most = np.linalg.norm(end - start, axis=1)[ends].max(axis=1, initial=0.0)
             fast = np.flatnonzero((most > _DEEPER * wall.depth) & self._applies[:, i])
@@ -350,7 +350,7 @@ class BarsAtWalls:
         contact, poses, worst = self._contact, self._contact.motion.poses(0.0), (0.0, 0, 0)
         for i, k in enumerate(self.walls):
             bars = np.flatnonzero(self._applies[:, i])
-            gaps = contact.walls[k].body.deepest(poses.rest(k, x[self._mesh.bars[self._bars[bars]]]))[1]
+            gaps = contact.walls[k].deepest(poses.rest(k, x[self._mesh.bars[self._bars[bars]]]))[1]
             if len(gaps) and gaps.min() < -BEYOND * length:
                 worst = min(worst, (float(gaps.min()), k, int(self._mesh.bar_ids[self._bars[bars[gaps.argmin()]]])))
         depth, k, bar = min(self._mesh.comm.allgather(worst))
@@ -393,7 +393,7 @@ class BarsAtWalls:
 
     def _respond(self, k: int, here: BarContacts, motion: BarMotion) -> Response:
         """Return what wall k does to bars."""
-        wall = self._contact.walls[k].body
+        wall = self._contact.walls[k]
         gaps, touch = motion.gaps, motion.gaps < 0.0
         t = np.where(touch, motion.t, here.memory[:, PLACE])
         normals = motion.poses.turned(k, _normals(wall, motion.poses.rest(k, motion.x), t))

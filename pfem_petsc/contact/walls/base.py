@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from functools import cached_property
 from typing import Annotated, Any, Literal
 
 import numpy as np
@@ -192,7 +191,6 @@ class BaseWall(ABC):
     width : smallest extent [m] of a wall that bars can cross between their nodes, infinite for others
     thickness : of a sheet [m], None of others
     centre : (3,) [m], the point whose position is recorded if the wall moves
-    body : the wall as bars touch it between their nodes
     """
 
     flat = False
@@ -202,10 +200,6 @@ class BaseWall(ABC):
     width = np.inf
     thickness: float | None = None
     centre: np.ndarray
-
-    @cached_property
-    def body(self) -> BaseWall:
-        return self
 
     @abstractmethod
     def planes(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -1,5 +1,4 @@
-"""A finite rectangle; it stops nodes that come from the side its normal points to, and nodes can pass beside it. Bars
-between them touch it as the front of a plate with a thickness."""
+"""A finite rectangle; it stops nodes that come from the side its normal points to, and nodes can pass beside it."""
 
 from __future__ import annotations
 
@@ -9,7 +8,7 @@ import numpy as np
 from pydantic import model_validator
 
 from ...case.base import PositiveFloat, Vector3, listed
-from .base import BaseWall, Surface, WallKeys, direction, slab
+from .base import Surface, WallKeys, direction, slab
 from .plane import Wall as Plane
 
 _SLACK = 1e-6  # distance of both ends from the plane, over their length, beyond which bars cross it
@@ -26,8 +25,6 @@ class Parameters(WallKeys):
     """Direction of the first edges; its component along the normal is ignored."""
     size: Annotated[tuple[PositiveFloat, PositiveFloat], listed]
     """Lengths of the edges along ``along`` and across it [m]."""
-    thickness: PositiveFloat | None = None
-    """of a plate behind the rectangle, which bars that touch do not pass between their nodes [m]"""
 
     @model_validator(mode="after")
     def _spans(self) -> Parameters:
@@ -38,29 +35,11 @@ class Parameters(WallKeys):
         return self
 
 
-class Plate(BaseWall):
-    """The box (2 a x 2 b x t) behind a rectangle, which bars touch between their nodes."""
-
-    def __init__(self, front: Wall, thickness: float) -> None:
-        self.centre, self.width, self.thickness = front.centre - 0.5 * thickness * front.normal, front.width, thickness
-        self._axes = np.array([front.first, front.second, front.normal])
-        self._half = np.append(front.half, 0.5 * thickness)
-
-    def planes(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        place = (x - self.centre) @ self._axes.T
-        beyond = np.abs(place) - self._half
-        arm, deepest = np.maximum(beyond, 0.0), beyond.max(axis=1)
-        inside = deepest <= 0.0
-        arm[inside] = np.eye(3)[beyond[inside].argmax(axis=1)]
-        length = np.linalg.norm(arm, axis=1)
-        normals = (np.copysign(arm, place) / length[:, None]) @ self._axes
-        return normals, np.einsum("mi,mi->m", normals, x) - np.where(inside, deepest, length)
-
-
 class Wall(Plane):
     """A part of the plane n . x = d."""
 
     partial = True
+    solid = False
 
     def __init__(self, parameters: Parameters) -> None:
         super().__init__(parameters)
@@ -69,9 +48,7 @@ class Wall(Plane):
         self.first = along / np.linalg.norm(along)
         self.second = np.cross(self.normal, self.first)
         self.half = 0.5 * np.array(parameters.size)
-        self.width, self.thickness = min(parameters.size), parameters.thickness
-        self.solid = self.thickness is not None
-        self.body = Plate(self, self.thickness) if self.solid else self
+        self.width = min(parameters.size)
 
     def stops(self, before: np.ndarray, x: np.ndarray, tolerance: float) -> np.ndarray:
         start = before @ self.normal - self.offset
@@ -86,8 +63,6 @@ class Wall(Plane):
         return (np.abs(point @ self.first) <= self.half[0]) & (np.abs(point @ self.second) <= self.half[1])
 
     def crossed(self, starts: np.ndarray, ends: np.ndarray) -> np.ndarray:
-        if self.solid:
-            return self.body.crossed(starts, ends)
         first, second = starts @ self.normal - self.offset, ends @ self.normal - self.offset
         across = np.minimum(np.abs(first), np.abs(second)) > _SLACK * np.linalg.norm(ends - starts, axis=1)
         across &= (first < 0.0) != (second < 0.0)
@@ -100,5 +75,4 @@ def surface(parameters: Parameters, bounds: np.ndarray) -> Surface:
     wall = Wall(parameters)
     a, b = wall.half[0] * wall.first, wall.half[1] * wall.second
     face = np.array([wall.centre - a - b, wall.centre + a - b, wall.centre + a + b, wall.centre - a + b])
-    thickness = parameters.thickness or 0.05 * (np.linalg.norm(bounds[1] - bounds[0]) or 1.0)
-    return slab(parameters.name, face, wall.normal, thickness)
+    return slab(parameters.name, face, wall.normal, 0.05 * (np.linalg.norm(bounds[1] - bounds[0]) or 1.0))

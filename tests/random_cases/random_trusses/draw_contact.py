@@ -197,9 +197,6 @@ def draw_bars_touch(chance: random.Random, case: dict[str, Any], body: Body, mot
     elif case["time"]["step"] != "auto":  # keep clear of the critical step
         case["time"]["step"] *= 0.6
         case["time"]["end"] *= 0.6
-    for wall in case.get("wall", ()):
-        if wall["type"] == "rectangle" and scheme != "energy_momentum" and chance.random() < 0.5:
-            wall["thickness"] = body.length * chance.uniform(0.05, 0.5)
     table: dict[str, Any] = {}
     lossy = scheme != "energy_momentum"
     if lossy and chance.random() < 0.5:

@@ -90,7 +90,9 @@ def compare(name: str, values: list[float], by_hand: list[float], close: list[fl
 
 
 def numbers(printed: str, *names: str) -> list[float]:
-    return [float(re.search(rf"^ *{name}(?: [a-z]+)? +(-?[\d.e+-]+)", printed, flags=re.MULTILINE)[1]) for name in names]
+    return [
+        float(re.search(rf"^ *{name}(?: [a-z]+)? +(-?[\d.e+-]+)", printed, flags=re.MULTILINE)[1]) for name in names
+    ]
 
 
 def test_every_recipe_is_listed_and_has_figures():

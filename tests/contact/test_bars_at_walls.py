@@ -260,5 +260,6 @@ def test_friction_alone_holds_a_bar(clear, comm, shared_tmp_path):
 def test_wall_that_presses_more_than_a_contact_bears(comm, shared_tmp_path):
     """Statics: where the springs of a bar would pull it through a thin wall, the run ends and names both."""
     case = at_rest({**CYLINDER, "radius": 0.05, "point": [0.0, 0.0, 0.4]}, motion=[[0.0, 0, 0, 0], [1.0, 0, 0, 0.8]])
-    with pytest.raises(SimulationFailure, match=r"no equilibrium .* 0\.36.*: bar 0 and wall 'w' would pass through each"):
+    told = r"no equilibrium .* 0\.36.*: bar 0 and wall 'w' would pass through each"
+    with pytest.raises(SimulationFailure, match=told):
         rows_of(case, comm, shared_tmp_path)

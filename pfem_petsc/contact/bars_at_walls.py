@@ -99,8 +99,9 @@ def resist(law, here, push, slip, mobility, normals):
     """Return the forces along the normals (m,) of springs that ``push`` (m,) [N] with their dampers, elastic slips
     (m, 3) [m], and the energies (m,) [J] that both lose as bars ``slip`` (m, 3) [m] in a step.
 
-    ``law``: PairLaw; ``here``: BarContacts; ``mobility`` (m,) [1/kg]; ``normals`` (m, 3). The force of a damper by the
-    velocity at the end of a step also changes with those of the other walls that the bar touches.
+    ``law``: PairLaw; ``here``: BarContacts; ``mobility`` (m,) of the distances [1/kg]; ``normals`` (m, 3) their
+    derivatives, which at edges are shorter than 1. The force of a damper by the velocity at the end of a step also
+    changes with those of the other walls that the bar touches.
     """
     total, end, lost = push.copy(), np.zeros(slip.shape), np.zeros(len(push))
     for p in range(len(push)):
@@ -109,7 +110,8 @@ def resist(law, here, push, slip, mobility, normals):
             shared = PairLaw(law.friction, law.damping, law.step, law.way, law.base, law.lead * here.count[p])
             total[p] = damp(push[p], k, dot(n, way), mobility[p], shared, np.inf)
         size, spring = max(sqrt(dot(n, n)), 1e-300), (old[SPRING], old[SPRING + 1], old[SPRING + 2])
-        stop, _, lost[p] = slide(spring, k, law.friction * total[p] / max(k, 1e-300), way, times(1.0 / size, n))
+        most = law.friction * total[p] * size / max(k, 1e-300)
+        stop, _, lost[p] = slide(spring, k, most, way, times(1.0 / size, n))
         put(end, p, stop)
         before = (old[NORMAL], old[NORMAL + 1], old[NORMAL + 2])
         lost[p] -= 0.5 * ((total[p] - push[p]) * dot(n, way) + old[DAMPER] * dot(before, way))
@@ -401,7 +403,8 @@ class BarsAtWalls:
         point, start = (np.einsum("me,mei->mi", weights, ends) for ends in (motion.x, motion.before))
         slip = point - start - motion.earlier.ways(motion.poses, start)[:, k]
         stiffness, push = here.stiffness, np.where(touch, -here.stiffness * gaps, 0.0)
-        mobility = (weights**2 * here.inverse).sum(axis=1) + self._wall_mobility(k, point, normals)
+        mobility = (weights**2 * here.inverse).sum(axis=1) * (normals**2).sum(axis=1)
+        mobility += self._wall_mobility(k, point, normals)
         law = self._law(k, motion.step)
         total, end, lost = resist(law, here, push, slip, mobility, normals)
         force = total[:, None] * normals - stiffness[:, None] * end

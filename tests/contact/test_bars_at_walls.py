@@ -92,6 +92,29 @@ def test_bar_across_the_edge_of_a_box(integrator, comm, shared_tmp_path):
     np.testing.assert_allclose(run.state.v[:, [0, 2]], 0.5, rtol=0.01)  # it was hit in its middle
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("integrator", ["central_differences", "generalized_alpha"])
+@pytest.mark.parametrize("restitution", [1.0, 0.5, 0.2])
+def test_coulomb_and_restitution_at_an_edge(integrator, restitution, comm, shared_tmp_path):
+    """A bar across an edge, at any angle to the faces, rubs by Coulomb's law with the force across both, and rebounds
+    by the velocity across both, though the distance from a face changes by less."""
+    file = write_surface(shared_tmp_path / "box.obj", *box((-1.0, -1.0, -1.0), (1.0, 1.0, 0.0)), comm)
+    for k, angle in enumerate(np.deg2rad([45.0, 20.0])):
+        across, along = np.array([np.sin(angle), 0.0, np.cos(angle)]), np.array([np.cos(angle), 0.0, -np.sin(angle)])
+        points = np.array([1.0, 0.0, 0.0]) + 0.02 * across + 0.7 * np.outer([-1.0, 1.0], along)
+        sticky = 0.0 if integrator != "central_differences" else 0.1
+        wall = {"type": "surface", "file": file, "restitution": restitution, "friction": sticky}
+        case = falling(wall, points.tolist(), -across + [0.0, 0.9, 0.0], step=1e-4, end=0.1)
+        case["time"]["integrator"] = integrator
+        rows, run = rows_of(case, comm, shared_tmp_path, f"{k}")
+        leaves = 0.5 * comm.allreduce(float((run.state.v @ across).sum()))
+        assert leaves == pytest.approx(restitution, rel=0.01 if sticky else 0.03)
+        if sticky:
+            impulse = np.array(rows[-1]["wall/w/impulse"])
+            rubbed = np.hypot(impulse @ along, impulse[1])  # less, as the force grows with an elastic slip
+            assert rubbed == pytest.approx(sticky * impulse @ across, rel=0.06)
+
+
 @pytest.mark.parametrize("integrator", ["central_differences", "generalized_alpha"])
 def test_bar_on_the_edge_of_a_sheet(integrator, comm, shared_tmp_path):
     """A sheet with a thickness is round at its edge: the bar leaves as it came; one that is thin lets it pass."""

@@ -103,8 +103,7 @@ class StrictModel(BaseModel):
                 refuse_if(not least <= len(given) <= 1, text, ValueError)
         for kind in reversed(type(self).__mro__):
             for test, text in kind.__dict__.get("conflicts", ()):
-                if test(self):
-                    raise ValueError(text.format(self))
+                refuse_if(test(self), text.format(self), ValueError)
         return self
 
     def __setattr__(self, key: str, value: Any) -> None:

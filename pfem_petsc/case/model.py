@@ -26,7 +26,7 @@ from pydantic_core import CoreSchema, core_schema
 
 from ..columns import cell_fields, point_fields
 from ..contact.walls.base import WALLS, WallKeys
-from ..errors import InputError
+from ..errors import InputError, refuse_if
 from ..mechanics.materials.base import LAWS, MaterialKeys, internal_variables, law_name
 from ..registry import added_file, choices, lookup, modules, nearest
 from . import load_cases
@@ -393,8 +393,7 @@ class _Initial(t.Initial):
     @field_validator("node_set")
     @classmethod
     def _everywhere(cls, name: str | None) -> None:
-        if name is not None:
-            raise ValueError("the velocity of a node set belongs under a heading [[initial.on]]")
+        refuse_if(name is not None, "the velocity of a node set belongs under a heading [[initial.on]]", ValueError)
 
 
 class _Initials(Chosen):
@@ -452,8 +451,11 @@ class LoadCase(StrictModel):
 
     @model_validator(mode="after")
     def _loads(self) -> LoadCase:
-        if not any(getattr(self, key) for key in load_cases.TABLES):
-            raise ValueError(f"has no loads: expected at least one of the tables {', '.join(load_cases.TABLES)}")
+        refuse_if(
+            not any(getattr(self, key) for key in load_cases.TABLES),
+            f"has no loads: expected at least one of the tables {', '.join(load_cases.TABLES)}",
+            ValueError,
+        )
         if self.wind is not None and self.wind.varies:
             raise refusal((("wind", "velocity"), "a load case takes a constant wind [vx, vy, vz]", None))
         return self

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, Self
 
-from ..errors import InputError
+from ..errors import InputError, refuse_if
 from ..mechanics.materials.base import law_of
 from ..registry import add_plugin, has_plugin, nearest
 from . import load_cases
@@ -357,11 +357,11 @@ class Case(_Tables):
         settle(self)
 
     def _check_not_fixed(self) -> None:
-        if self.fixed:
-            raise InputError(
-                f"{self.source}: the case of a simulation cannot be changed; change the case that it was made from, "
-                "and make another simulation"
-            )
+        refuse_if(
+            self.fixed,
+            f"{self.source}: the case of a simulation cannot be changed; change the case that it was made from, "
+            "and make another simulation",
+        )
 
     def update(self, changes: Mapping[str, Any] | None = None, /, **named: Any) -> None:
         """Make several changes, and validate them together.
@@ -510,10 +510,14 @@ def _hint(key: str, known: Iterable[str]) -> str:
 
 def _checked_name(name: Any, source: str) -> str:
     """Return the name of a case, which is the default folder of its results below ``results``."""
-    if not isinstance(name, str) or not name.strip() or "\0" in name:
-        raise InputError(f"{source}: name = {name!r:.60}: expected a text, the default folder of the results")
-    if name.startswith("/") or ".." in name.split("/"):
-        raise InputError(f"{source}: name = {name!r:.60}: expected the name of a folder below results")
+    refuse_if(
+        not isinstance(name, str) or not name.strip() or "\0" in name,
+        f"{source}: name = {name!r:.60}: expected a text, the default folder of the results",
+    )
+    refuse_if(
+        name.startswith("/") or ".." in name.split("/"),
+        f"{source}: name = {name!r:.60}: expected the name of a folder below results",
+    )
     return name
 
 

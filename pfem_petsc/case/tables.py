@@ -284,8 +284,11 @@ class Section(StrictModel):
         if not isinstance(data, Mapping) or info.context is None or not {"catalogue", "profile"} & set(data):
             return data
         for key in ("catalogue", "profile"):
-            if not isinstance(data.get(key), str) or not data[key]:
-                raise ValueError("catalogue (a CSV file) and profile (a name in it) need each other")
+            refuse_if(
+                not isinstance(data.get(key), str) or not data[key],
+                "catalogue (a CSV file) and profile (a name in it) need each other",
+                ValueError,
+            )
         try:
             values = profile_of(Path(info.context.folder, data["catalogue"]), data["profile"], list(cls.model_fields))
         except InputError as error:
@@ -300,8 +303,11 @@ class Section(StrictModel):
     @classmethod
     def _factor(cls, value: Any) -> Any:
         rows = value if has_rows(value) else [[0.0, value]] if value is not None else []
-        if not all(1e-3 < row[1] < 1e3 for row in rows):
-            raise ValueError("expected a factor on the length in the mesh, like 0.99, or rows [t, factor]")
+        refuse_if(
+            not all(1e-3 < row[1] < 1e3 for row in rows),
+            "expected a factor on the length in the mesh, like 0.99, or rows [t, factor]",
+            ValueError,
+        )
         return value
 
     @property
@@ -332,8 +338,11 @@ class Section(StrictModel):
             found = self.cross_section(np.array([trial]))
         except OverflowError:
             found = CrossSection(0.0, 0.0, 0.0, 0.0, 0.0)
-        if not np.all(np.isfinite(np.hstack(found))) or not np.all(np.asarray(found.area) > 0.0):
-            raise ValueError(f"sizes are out of range, in square metres: {self.sizes}")
+        refuse_if(
+            not np.all(np.isfinite(np.hstack(found))) or not np.all(np.asarray(found.area) > 0.0),
+            f"sizes are out of range, in square metres: {self.sizes}",
+            ValueError,
+        )
         return self
 
 

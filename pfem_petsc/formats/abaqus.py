@@ -20,7 +20,7 @@ from typing import Any
 
 import numpy as np
 
-from ..errors import InputError
+from ..errors import refuse_if
 from ..mesh.whole import PLANE, WholeMesh
 from ._abaqus_model import AtNodes, Block, Deck, blocks, listed
 from ._common import alike, free_name, name_of, number_of
@@ -47,8 +47,7 @@ def read(path: Path, fields: Collection[str] | None = None) -> WholeMesh:
         if not deck.add(block):
             break
     mesh = deck.mesh()
-    if len(mesh.bars) == 0:
-        raise InputError(f"{path}: has no trusses or beams, which would be bars")
+    refuse_if(len(mesh.bars) == 0, f"{path}: has no trusses or beams, which would be bars")
     _add_materials(mesh, deck)
     _add_sections(mesh, deck)
     told = [*mesh.warnings]

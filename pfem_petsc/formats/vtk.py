@@ -29,7 +29,7 @@ from xml.sax.saxutils import escape
 
 import numpy as np
 
-from ..errors import InputError
+from ..errors import InputError, refuse_if
 from ._common import drop_bare_nodes, edges
 
 if TYPE_CHECKING:
@@ -62,8 +62,7 @@ def read(path: Path, fields: Collection[str] | None = None) -> WholeMesh:
     command = [sys.executable, "-P", "-m", __name__, str(path.resolve())]
     path_of_modules = {"PYTHONPATH": os.pathsep.join(p for p in sys.path if p)}
     done = subprocess.run(command, env=os.environ | path_of_modules, capture_output=True, check=False)
-    if done.returncode == _REFUSED:
-        raise InputError(f"{path}: {done.stdout.decode(errors='replace').strip()}")
+    refuse_if(done.returncode == _REFUSED, f"{path}: {done.stdout.decode(errors='replace').strip()}")
     if done.returncode < 0:
         raise InputError(
             f"{path}: VTK ended with signal {signal.Signals(-done.returncode).name} while reading it; "
@@ -147,17 +146,19 @@ def _check_legacy(path: Path, grid: Any) -> None:
     cells = [getattr(grid, kind)() for kind in kinds if hasattr(grid, kind)]
     taken = sum(part.GetNumberOfCells() + part.GetNumberOfConnectivityIds() for part in cells)
     size = sum(int(count) for _, count in declared)
-    if taken != size:
-        raise ValueError(f"its cells need {taken} numbers, and it says that they have {size}: write it again")
+    refuse_if(
+        taken != size, f"its cells need {taken} numbers, and it says that they have {size}: write it again", ValueError
+    )
 
 
 def _arrays(grid: Any) -> Iterator[tuple[str, Any]]:
     from vtkmodules.util.numpy_support import vtk_to_numpy
 
-    if grid is None or not (grid.IsA("vtkUnstructuredGrid") or grid.IsA("vtkPolyData")):
-        raise ValueError(
-            f"holds a {grid.GetClassName() if grid else 'nothing'}, not an unstructured grid or polygonal data"
-        )
+    refuse_if(
+        grid is None or not (grid.IsA("vtkUnstructuredGrid") or grid.IsA("vtkPolyData")),
+        f"holds a {grid.GetClassName() if grid else 'nothing'}, not an unstructured grid or polygonal data",
+        ValueError,
+    )
     texts = grid.GetFieldData()
     if grid.IsA("vtkPolyData"):
         from vtkmodules.vtkFiltersCore import vtkAppendFilter
@@ -167,24 +168,34 @@ def _arrays(grid: Any) -> Iterator[tuple[str, Any]]:
         join.Update()
         grid = join.GetOutput()
     n_nodes, n_cells = grid.GetNumberOfPoints(), grid.GetNumberOfCells()
-    if n_nodes == 0 or n_cells == 0:
-        raise ValueError(f"{n_nodes} points and {n_cells} cells: not a mesh of bars, or a damaged file")
+    refuse_if(
+        n_nodes == 0 or n_cells == 0,
+        f"{n_nodes} points and {n_cells} cells: not a mesh of bars, or a damaged file",
+        ValueError,
+    )
     kinds = vtk_to_numpy(grid.GetCellTypesArray())
     lines = np.isin(kinds, (_LINE, _POLY_LINE))
     of_faces = not lines.any()
     cells = np.flatnonzero(np.isin(kinds, _FACES) if of_faces else lines)
-    if len(cells) == 0:
-        raise ValueError(
-            f"cells of types {np.unique(kinds).tolist()}; bars are lines (type 3) or edges of faces (types 5, 7, 9), "
-            "and there are none"
-        )
+    refuse_if(
+        len(cells) == 0,
+        f"cells of types {np.unique(kinds).tolist()}; bars are lines (type 3) or edges of faces (types 5, 7, 9), "
+        "and there are none",
+        ValueError,
+    )
     ends = vtk_to_numpy(grid.GetCells().GetConnectivityArray())
     offsets = vtk_to_numpy(grid.GetCells().GetOffsetsArray()).astype(np.int64)
     first, size = offsets[cells], offsets[cells + 1] - offsets[cells]
-    if np.any((size != 2) & (kinds[cells] == _LINE)) or np.any(size < 2):
-        raise ValueError("lines that do not have two ends; a bar has two")
-    if first.min() < 0 or (first + size).max() > len(ends):
-        raise ValueError("lines whose nodes do not exist: a damaged file")
+    refuse_if(
+        np.any((size != 2) & (kinds[cells] == _LINE)) or np.any(size < 2),
+        "lines that do not have two ends; a bar has two",
+        ValueError,
+    )
+    refuse_if(
+        first.min() < 0 or (first + size).max() > len(ends),
+        "lines whose nodes do not exist: a damaged file",
+        ValueError,
+    )
     for wrong in ends[(ends < 0) | (ends >= n_nodes)][:1]:
         raise ValueError(f"there is no point {wrong}, at which a cell ends: the file has {n_nodes}, numbered from 0")
     # a line of several points is as many bars less one, a face as many as it has corners: the cell of each bar, and
@@ -224,8 +235,11 @@ def _groups_of(data: Any, fields: Any, kept: slice | np.ndarray) -> dict[str, np
     }
     for array in [name for name in _NAMED if data.GetArray(name) is not None]:
         values = arrays.get(array)
-        if values is None or not np.array_equal(values, np.rint(values)):
-            raise ValueError(f"array {array!r} must hold one whole number for each")
+        refuse_if(
+            values is None or not np.array_equal(values, np.rint(values)),
+            f"array {array!r} must hold one whole number for each",
+            ValueError,
+        )
         values, names = values[kept].astype(np.int64), fields.GetAbstractArray(f"{array}_names")
         n_names = names.GetNumberOfValues() if names is not None and names.IsA("vtkStringArray") else 0
         for i in np.unique(values[values >= 0]).tolist():
@@ -259,8 +273,7 @@ def write(path: Path, mesh: WholeMesh) -> None:
     # VTK writes names into XML as they are
     named = str if legacy else partial(escape, entities={'"': "&quot;", "\t": "&#9;", "\n": "&#10;", "\r": "&#13;"})
     writer.SetInputData(grid_of(mesh, named, polygonal=path.suffix.lower() == ".vtp"))
-    if not writer.Write() or not path.is_file():
-        raise InputError(f"{path}: VTK could not write the file; is there room?")
+    refuse_if(not writer.Write() or not path.is_file(), f"{path}: VTK could not write the file; is there room?")
 
 
 def grid_of(mesh: WholeMesh, named: Callable[[str], str] = str, polygonal: bool = False) -> pyvista.DataSet:

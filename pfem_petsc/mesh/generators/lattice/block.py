@@ -26,7 +26,7 @@ from ....case.base import (
     is_finite_number,
     listed,
 )
-from ....errors import InputError
+from ....errors import InputError, refuse_if
 from ...slab import check_length, check_size
 from ..base import Length
 from .cells import ANGLE, KINDS, UnitCell, auxetic, cell_of
@@ -51,17 +51,20 @@ class CellKeys(StrictModel):
     @model_validator(mode="after")
     def _joined(self) -> CellKeys:
         count = len(self.points)
-        if not self.points or not self.struts:
-            raise ValueError("expected at least one point and one strut")
+        refuse_if(not self.points or not self.struts, "expected at least one point and one strut", ValueError)
         for number, strut in enumerate(self.struts):
             where = f"struts[{number}] = {list(strut)}"
-            if len(strut) not in (2, 5) or not all(0 <= p < count for p in strut[:2]):
-                raise ValueError(
-                    f"{where}: expected two numbers of points, 0 to {count - 1}, or these and the cell (i, j, k) of "
-                    "the second one"
-                )
-            if any(abs(i) > 1 for i in strut[2:]):
-                raise ValueError(f"{where}: expected -1, 0 or 1 for the cell of the second point")
+            refuse_if(
+                len(strut) not in (2, 5) or not all(0 <= p < count for p in strut[:2]),
+                f"{where}: expected two numbers of points, 0 to {count - 1}, or these and the cell (i, j, k) of "
+                "the second one",
+                ValueError,
+            )
+            refuse_if(
+                any(abs(i) > 1 for i in strut[2:]),
+                f"{where}: expected -1, 0 or 1 for the cell of the second point",
+                ValueError,
+            )
         for name, members in (self.groups or {}).items():
             if wrong := [m for m in members if m >= len(self.struts)]:
                 raise ValueError(
@@ -179,8 +182,11 @@ class Parameters(StrictModel):
     def _factors(cls, value: Any) -> Any:
         if value is None:
             return None
-        if not isinstance(value, list | tuple) or len(value) != 3:
-            raise ValueError('expected three factors on the pitch along x, y and z, like [1, 1, "1 + 2*z"]')
+        refuse_if(
+            not isinstance(value, list | tuple) or len(value) != 3,
+            'expected three factors on the pitch along x, y and z, like [1, 1, "1 + 2*z"]',
+            ValueError,
+        )
         for axis, factor in zip(COORDINATES, value):
             if isinstance(factor, str):
                 Expression(factor, (axis,))
@@ -191,8 +197,11 @@ class Parameters(StrictModel):
     @model_validator(mode="after")
     def _consistent(self) -> Parameters:
         for name in self.fields or {}:
-            if not can_be_variable(name):
-                raise ValueError(f"fields.{name}: expected a name of letters, digits and underscores")
+            refuse_if(
+                not can_be_variable(name),
+                f"fields.{name}: expected a name of letters, digits and underscores",
+                ValueError,
+            )
         self.expressions()
         curved, shell = self.curved is not None, self.curved is not None and self.curved.closed
         needs_cells = self.surface is None or curved or self.map is not None
@@ -463,11 +472,11 @@ class Block(Joints):
         self.disturbed = self._amplitude > 0.0
         edges = [np.diff(level[:-1]).min() for level in self._levels]
         shortest = float(np.linalg.norm(cell.spans * np.array(edges), axis=1).min())
-        if self._amplitude and 2.0 * math.sqrt(3.0) * self._amplitude >= shortest:
-            raise InputError(
-                f"mesh.perturbation = {keys.perturbation!r}: ends of a strut of {shortest:.4g} m could meet; choose "
-                f"less than {shortest / (2.0 * math.sqrt(3.0) * keys.pitch):.4g}"
-            )
+        refuse_if(
+            self._amplitude and 2.0 * math.sqrt(3.0) * self._amplitude >= shortest,
+            f"mesh.perturbation = {keys.perturbation!r}: ends of a strut of {shortest:.4g} m could meet; choose "
+            f"less than {shortest / (2.0 * math.sqrt(3.0) * keys.pitch):.4g}",
+        )
         sizes = zip(self.cells / np.array(cell.layers), self._levels)
         self._extents = np.array([np.interp(size, np.arange(len(level)), level) for size, level in sizes])
         farthest = float(np.abs(keys.origin or 0.0).max()) + float(self._extents.max())
@@ -484,19 +493,19 @@ class Block(Joints):
         curved, extents = self.keys.curved, self._extents
         inner, outer = curved.radius, curved.radius + float(extents[2])
         if curved.shape == "cylinder":
-            if not self.closed and extents[0] > 2.0 * np.pi * inner * (1.0 + 1e-9):
-                raise InputError(
-                    f"mesh.curved.radius = {inner!r}: the block is {extents[0]:.6g} m long, more than the "
-                    f"circumference of {2.0 * np.pi * inner:.6g} m; use fewer cells, or closed = true"
-                )
+            refuse_if(
+                not self.closed and extents[0] > 2.0 * np.pi * inner * (1.0 + 1e-9),
+                f"mesh.curved.radius = {inner!r}: the block is {extents[0]:.6g} m long, more than the "
+                f"circumference of {2.0 * np.pi * inner:.6g} m; use fewer cells, or closed = true",
+            )
             angle = 2.0 * np.pi if self.closed else extents[0] / inner
             return float(0.5 * angle * (outer**2 - inner**2) * extents[1])
         half = 0.5 * extents[:2] / inner
-        if half.max() >= 0.45 * np.pi:
-            raise InputError(
-                f"mesh.curved.radius = {inner!r}: the block spans {np.degrees(2.0 * half.max()):.0f} degrees of the "
-                "sphere; at most 160 are mapped: use fewer cells or a larger radius"
-            )
+        refuse_if(
+            half.max() >= 0.45 * np.pi,
+            f"mesh.curved.radius = {inner!r}: the block spans {np.degrees(2.0 * half.max()):.0f} degrees of the "
+            "sphere; at most 160 are mapped: use fewer cells or a larger radius",
+        )
         solid_angle = 4.0 * np.arcsin(np.sin(half[0]) * np.sin(half[1]))
         return float(solid_angle * (outer**3 - inner**3) / 3.0)
 
@@ -587,10 +596,10 @@ def _borders(edge: float, factor: str, axis: int) -> Iterator[float]:
 
     def slope(x: float) -> float:
         value = float(expression({name: np.array([x])})[0])
-        if not (np.isfinite(value) and value > 0.0):
-            raise InputError(
-                f"mesh.grading[{axis}]: {factor!r} is {value:g} at {name} = {x:g} m; expected a factor > 0 in the block"
-            )
+        refuse_if(
+            not (np.isfinite(value) and value > 0.0),
+            f"mesh.grading[{axis}]: {factor!r} is {value:g} at {name} = {x:g} m; expected a factor > 0 in the block",
+        )
         return edge * value
 
     x, h = 0.0, 1.0 / _STEPS
@@ -623,11 +632,11 @@ def fitted(keys: Parameters, surface: Surface) -> Parameters:
     for axis, factor in enumerate(keys.grading or (1.0, 1.0, 1.0)):
         edge = keys.pitch * cell.aspect[axis]
         if isinstance(factor, str):
-            if origin[axis] > low[axis] + 1e-9 * edge:
-                raise InputError(
-                    f"mesh.grading[{axis}] = {factor!r}: an expression begins at mesh.origin, and the surface below it "
-                    f"would stay empty: use {COORDINATES[axis]} = {low[axis]:.9g} or less there, or leave the key out"
-                )
+            refuse_if(
+                origin[axis] > low[axis] + 1e-9 * edge,
+                f"mesh.grading[{axis}] = {factor!r}: an expression begins at mesh.origin, and the surface below it "
+                f"would stay empty: use {COORDINATES[axis]} = {low[axis]:.9g} or less there, or leave the key out",
+            )
             count[axis] = graded_count(float(high[axis] - origin[axis]), edge, factor, axis)
             continue
         first = np.floor((low[axis] - origin[axis]) / (edge * factor) + 1e-9)
@@ -636,8 +645,9 @@ def fitted(keys: Parameters, surface: Surface) -> Parameters:
     size = f"a surface of {' x '.join(f'{length:.4g}' for length in high - low)} m"
     if keys.surface.scale == 1.0:
         size += " (if its file is in millimetres, set mesh.surface.scale = 0.001)"
-    if not (count < float(np.iinfo(np.int64).max) / 16.0).all():
-        raise InputError(f"mesh.pitch = {keys.pitch!r}: too small for {size}")
+    refuse_if(
+        not (count < float(np.iinfo(np.int64).max) / 16.0).all(), f"mesh.pitch = {keys.pitch!r}: too small for {size}"
+    )
     check_size(
         math.prod(int(number) for number in count.tolist()),
         f"mesh.pitch = {keys.pitch!r}, with cells that cover {size}",

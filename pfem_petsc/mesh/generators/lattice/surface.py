@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ....errors import InputError
+from ....errors import InputError, refuse_if
 from ...tools import components
 from .expressions import read_vtk
 
@@ -331,12 +331,15 @@ def read_surface(path: Path, scale: float) -> Surface:
         If the file is not there, is not of triangles, or the surface is open.
     """
     where = f"mesh.surface.file: {path}"
-    if path.suffix.lower() not in _SUFFIXES:
-        raise InputError(f"{where}: no reader for {path.suffix or 'no suffix'}; known: {', '.join(_SUFFIXES)}")
+    refuse_if(
+        path.suffix.lower() not in _SUFFIXES,
+        f"{where}: no reader for {path.suffix or 'no suffix'}; known: {', '.join(_SUFFIXES)}",
+    )
     data = read_vtk(path, where)
     points, triangles = _triangles(data)
-    if len(triangles) == 0 or not np.isfinite(points).all():
-        raise InputError(f"{where}: no surface of triangles could be read from it")
+    refuse_if(
+        len(triangles) == 0 or not np.isfinite(points).all(), f"{where}: no surface of triangles could be read from it"
+    )
     count, edge = _open_edges(triangles)
     if count:
         merged = _triangles(data, _MERGED)
@@ -350,8 +353,7 @@ def read_surface(path: Path, scale: float) -> Surface:
             f"from ({a}) to ({b}) in the file; close it in the program that made it (PyVista: mesh.fill_holes(size))"
         )
     surface = bodies_of(points, triangles, where)
-    if not surface.layers:
-        raise InputError(f"{where}: the surface encloses no volume")
+    refuse_if(not surface.layers, f"{where}: the surface encloses no volume")
     surface.points = scale * points
     return surface
 

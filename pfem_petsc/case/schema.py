@@ -267,16 +267,16 @@ class Case(_Tables):
         stages = stages_of(data, problems) if "stage" in data else []
         if not lenient:
             _add_plugins(data.get("plugins"), folder, problems)
-        reading = [Reading(tables, folder, lenient) for tables in (data, *(stage.data for stage in stages))]
-        model = _validated(data, reading[0], problems)
-        models = [
-            _validated(stage.data, each, problems, stage.place) for stage, each in zip(stages, reading[1:], strict=True)
-        ]
+        reading: list[Reading] = []
+
+        def validated(tables: Mapping[str, Any], place: Callable[[KeyPath], KeyPath] = tuple) -> Any:
+            reading.append(Reading(tables, folder, lenient))
+            return _validated(tables, reading[-1], problems, place)
+
+        model, models = validated(data), [validated(stage.data, stage.place) for stage in stages]
         if model is not None and None not in models and (model.load_case or model.combination):
             derived = load_case_stages(data, model, stages, [model, *models][-1], problems)
-            reading += (more := [Reading(stage.data, folder, lenient) for stage in derived])
-            pairs = zip(derived, more, strict=True)
-            models += [_validated(stage.data, each, problems, stage.place) for stage, each in pairs]
+            models += [validated(stage.data, stage.place) for stage in derived]
             stages += derived
         if model is not None and None not in models and not lenient:
             _check_sections(model, models, problems)
@@ -438,9 +438,8 @@ def _spread_damping(data: dict[str, Any], problems: Problems) -> None:
         if not isinstance(material, dict):
             continue
         for key in ("damping", "stiffness_damping"):
-            if material.get(key):
-                text = "[damping] gives each material its damping: remove this key, or that table"
-                problems.add(("material", name, key), text, material[key])
+            text = "[damping] gives each material its damping: remove this key, or that table"
+            problems.add_if(material.get(key), ("material", name, key), text, material.get(key))
         density = material.get("density")
         if is_finite_number(density):  # else it is refused
             material |= {"damping": of_mass * density, "stiffness_damping": of_stiffness}
@@ -456,12 +455,15 @@ def _validated(
     for key in [key for key in data if key not in KEYS]:
         problems.add((key,), f"unknown key{_hint(key, [*KEYS, 'damping'])}")
     for key in ("material", "section"):
-        if data.get(key, {}) == {}:
-            problems.add((), f"no [{key}.NAME] is given: a case needs at least one {key}")
-    if all(key in data for key in ANALYSES):
-        problems.add((), "[time] and [static] exclude each other: give one of them")
-    if not any(key in data for key in (*ANALYSES, "stage", "modes")):
-        problems.add((), "the table [time] is missing, or one of [static], [[stage]], [modes], which give the analysis")
+        problems.add_if(data.get(key, {}) == {}, (), f"no [{key}.NAME] is given: a case needs at least one {key}")
+    problems.add_if(
+        all(key in data for key in ANALYSES), (), "[time] and [static] exclude each other: give one of them"
+    )
+    problems.add_if(
+        not any(key in data for key in (*ANALYSES, "stage", "modes")),
+        (),
+        "the table [time] is missing, or one of [static], [[stage]], [modes], which give the analysis",
+    )
     # [[stage]] is checked by stages_of, which refuses an analysis beside it
     elsewhere = ("stage", *ANALYSES) if "stage" in data else ()
     known = {key: value for key, value in data.items() if key in KEYS and value is not None and key not in elsewhere}
@@ -473,24 +475,27 @@ def _check_sections(model: CaseModel, stages: list[CaseModel], problems: Problem
     wind = any(each.wind is not None for each in (model, *stages))
     for name, section in model.section.items():
         for key in ("drag_coefficient",) if section.shape is not None else ("diameter", "drag_coefficient"):
-            if getattr(section, key) is not None and not wind:
-                text = "has an effect in wind alone: remove the key, or give [wind]"
-                problems.add(("section", name, key), text, getattr(section, key))
+            text, value = "has an effect in wind alone: remove the key, or give [wind]", getattr(section, key)
+            problems.add_if(value is not None and not wind, ("section", name, key), text, value)
         material = model.material.get(section.material)
         if material is None or law_of(material).bar_data:  # whose law may use the shape
             continue
         warned = not material.describes_buckling and (section.shape is not None or section.second_moment is not None)
-        if section.effective_length != 1.0 and not warned:
-            text = "has no effect: bars of this material and section are not checked for buckling; remove the key"
-            problems.add(("section", name, "effective_length"), text, section.effective_length)
+        problems.add_if(
+            section.effective_length != 1.0 and not warned,
+            ("section", name, "effective_length"),
+            "has no effect: bars of this material and section are not checked for buckling; remove the key",
+            section.effective_length,
+        )
         path = ("section", name, "thickness")
         follows = section.area is None and section.area_field is None  # from the sizes
-        if path in problems.overridden and not follows and not wind:
-            text = (
-                "changes no result: stiffness and mass follow from area, and the law does not buckle; change area, or "
-                "give diameter instead of it"
-            )
-            problems.add(path, text, section.thickness)
+        problems.add_if(
+            path in problems.overridden and not follows and not wind,
+            path,
+            "changes no result: stiffness and mass follow from area, and the law does not buckle; change area, or "
+            "give diameter instead of it",
+            section.thickness,
+        )
 
 
 def _add_plugins(given: Any, folder: Path, problems: Problems) -> None:
@@ -562,26 +567,23 @@ class StageTables(NamedTuple):
 def stages_of(data: Mapping[str, Any], problems: Problems) -> list[StageTables]:
     """The stages of a case's nested tables; rejected ones are reported in ``problems`` and left out."""
     rows = data["stage"]
-    if not isinstance(rows, list) or not rows:
-        problems.add(("stage",), "expected a list of at least one table, each under a heading [[stage]]", rows)
+    text = "expected a list of at least one table, each under a heading [[stage]]"
+    if problems.add_if(not isinstance(rows, list) or not rows, ("stage",), text, rows):
         return []
-    for key in ANALYSES:
-        if key in data:
-            having = [f"stage[{k}].{key}" for k, row in enumerate(rows) if isinstance(row, Mapping) and key in row]
-            there = f"; this case has {', '.join(having)}" if having else ""
-            problems.add((), f"[{key}] and [[stage]] exclude each other: give [stage.{key}]{there}")
+    for key in [key for key in ANALYSES if key in data]:
+        having = [f"stage[{k}].{key}" for k, row in enumerate(rows) if isinstance(row, Mapping) and key in row]
+        there = f"; this case has {', '.join(having)}" if having else ""
+        problems.add((), f"[{key}] and [[stage]] exclude each other: give [stage.{key}]{there}")
     last = len(rows) - 1
     not_common = ("stage", "load_case", "combination", "modes", *ANALYSES)
     common = {key: value for key, value in data.items() if key not in not_common}
     owner: dict[str, int] = {}
     found: list[StageTables] = []
     for k, row in enumerate(rows):
-        if not isinstance(row, Mapping):
-            problems.add(("stage", k), "expected a table", row)
+        if problems.add_if(not isinstance(row, Mapping), ("stage", k), "expected a table", row):
             continue
-        name = _stage_name(row, k, problems)
-        if name in [stage.name for stage in found]:
-            problems.add(("stage", k, "name"), "another stage has this name", name)
+        name, taken = _stage_name(row, k, problems), [stage.name for stage in found]
+        problems.add_if(name in taken, ("stage", k, "name"), "another stage has this name", name)
         known = ["name", *ANALYSES, *STAGE_TABLES]
         for key in [key for key in row if key not in known]:
             problems.add(("stage", k, key), f"unknown key of a stage{nearest(key, known)}")
@@ -597,9 +599,8 @@ def stages_of(data: Mapping[str, Any], problems: Problems) -> list[StageTables]:
         owner |= dict.fromkeys((*given, *ANALYSES), k)
         owner.pop("output", None)
         chosen = [key for key in ANALYSES if key in row]
-        if len(chosen) != 1:
-            got = "not both" if chosen else "it has none"
-            problems.add(("stage", k), f"expected one of the tables [stage.time], [stage.static]; {got}")
+        text = f"expected one of the tables [stage.time], [stage.static]; {'not both' if chosen else 'it has none'}"
+        if problems.add_if(len(chosen) != 1, ("stage", k), text):
             continue
         here = {**common, chosen[0]: row[chosen[0]]}
         if k == last and "modes" in data:
@@ -617,8 +618,8 @@ def _stage_name(row: Mapping[str, Any], k: int, problems: Problems) -> str:
 
 def _sections(given: Any, common: Any, k: int, problems: Problems) -> Any:
     """The sections of a stage: those of the case, with the prestress that it gives."""
-    if not isinstance(given, Mapping) or not isinstance(common, Mapping):
-        problems.add(("stage", k, "section"), "expected tables by the names of sections", given)
+    tables = isinstance(given, Mapping) and isinstance(common, Mapping)
+    if problems.add_if(not tables, ("stage", k, "section"), "expected tables by the names of sections", given):
         return common
     merged = dict(common)
     for name, table in given.items():
@@ -649,26 +650,26 @@ def load_case_stages(
 
     ``start`` is the validated last stage, or the case without stages."""
     made: list[StageTables] = []
-    if model.modes is not None:
-        problems.add(("modes",), "modes are those of one state, and not of load cases: give a case without them")
+    text = "modes are those of one state, and not of load cases: give a case without them"
+    if problems.add_if(model.modes is not None, ("modes",), text):
         return []
     if not stages:
-        if model.static is None:
-            problems.add((), "[[load_case]] needs [static], by which each of them is solved, or static stages before")
+        text = "[[load_case]] needs [static], by which each of them is solved, or static stages before"
+        if problems.add_if(model.static is None, (), text):
             return []
         common = {key: value for key, value in data.items() if key not in ("load_case", "combination", "modes")}
         made.append(StageTables(load_cases.PERMANENT, common, (), (), {}, of=()))
     last = [*stages, *made][-1]
-    if "static" not in last.data:
-        problems.add((), f"load cases start from a static state, and the last stage {last.name!r} is none")
+    text = f"load cases start from a static state, and the last stage {last.name!r} is none"
+    if problems.add_if("static" not in last.data, (), text):
         return []
     static = last.data["static"] if isinstance(last.data["static"], Mapping) else {}
     method = static.get("method", "newton")
     if method == "force_density":  # the net as built
         static, method = {"method": "newton"}, "newton"
-    if method not in load_cases.METHODS:
-        known = ", ".join(load_cases.METHODS)
-        problems.add((), f"load cases are solved by the method of the state before them, one of {known}; got {method}")
+    known = ", ".join(load_cases.METHODS)
+    text = f"load cases are solved by the method of the state before them, one of {known}; got {method}"
+    if problems.add_if(method not in load_cases.METHODS, (), text):
         return []
     names = [stage.name for stage in (*stages, *made)]
     keys = [("load_case", k) for k in range(len(model.load_case))]
@@ -683,12 +684,10 @@ def load_case_stages(
     base = len(stages) + len(made) - 1
     for of, row in zip(keys, rows, strict=True):
         name = row.pop("name")
-        if name in names:
-            own = "the state before the load cases has this name: give another"
-            taken = (
-                own if not stages and name == load_cases.PERMANENT else "another load case, combination or stage has it"
-            )
-            problems.add((*of, "name"), taken, name)
+        before = not stages and name == load_cases.PERMANENT
+        text = "the state before the load cases has this name: give another"
+        text = text if before else "another load case, combination or stage has it"
+        problems.add_if(name in names, (*of, "name"), text, name)
         names.append(name)
         made.append(StageTables(name, {**common, **row}, tuple(row), (), {}, of=of, starts_from=base))
     return made

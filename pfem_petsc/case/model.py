@@ -26,7 +26,7 @@ from pydantic_core import CoreSchema, core_schema
 
 from ..columns import cell_fields, point_fields
 from ..contact.walls.base import WALLS, WallKeys
-from ..errors import InputError, refuse_if
+from ..errors import InputError
 from ..mechanics.materials.base import LAWS, MaterialKeys, internal_variables, law_name
 from ..registry import added_file, choices, lookup, modules, nearest
 from . import load_cases
@@ -40,6 +40,7 @@ from .base import (
     PositiveInt,
     StrictModel,
     listed,
+    must,
     refers,
     refusal,
 )
@@ -387,13 +388,13 @@ class _Start(t.Initial):
 class _Initial(t.Initial):
     """The table [initial]."""
 
+    node_set: Annotated[
+        t.NodeSetName | None,
+        must(lambda name: name is None, "the velocity of a node set belongs under a heading [[initial.on]]"),
+    ] = None
+    """name of a node set"""
     on: list[_Start] = []
     """velocities of node sets, each under a heading ``[[initial.on]]``"""
-
-    @field_validator("node_set")
-    @classmethod
-    def _everywhere(cls, name: str | None) -> None:
-        refuse_if(name is not None, "the velocity of a node set belongs under a heading [[initial.on]]", ValueError)
 
 
 class _Initials(Chosen):
@@ -436,6 +437,13 @@ Load = Annotated[
 class LoadCase(StrictModel):
     """Loads that act together, beside what the case has outside of load cases."""
 
+    conflicts = (
+        (
+            lambda own: not any(getattr(own, key) for key in load_cases.TABLES),
+            f"has no loads: expected at least one of the tables {', '.join(load_cases.TABLES)}",
+        ),
+    )
+
     name: Name
     """name of the load case in results, tables and messages; unique, also among combinations and stages"""
     load: Annotated[list[Load], listed] = []
@@ -450,12 +458,7 @@ class LoadCase(StrictModel):
     """supports that move, in the place of those of the same name or node set, under ``[[load_case.support]]``"""
 
     @model_validator(mode="after")
-    def _loads(self) -> LoadCase:
-        refuse_if(
-            not any(getattr(self, key) for key in load_cases.TABLES),
-            f"has no loads: expected at least one of the tables {', '.join(load_cases.TABLES)}",
-            ValueError,
-        )
+    def _constant_wind(self) -> LoadCase:
         if self.wind is not None and self.wind.varies:
             raise refusal((("wind", "velocity"), "a load case takes a constant wind [vx, vy, vz]", None))
         return self

@@ -112,9 +112,8 @@ def cross_section(
         return _without_shape(sizes, area, second_moment)
     allowed = {"round": ("diameter",), "tube": ("diameter", "thickness")}.get(shape, ("width", "height", "thickness"))
     allowed += ("web_thickness",) if shape in POLYGONS and POLYGONS[shape].webs else ()
-    foreign = [size for size in sizes if size not in allowed]
-    if foreign:
-        raise ValueError(f'{foreign[0]} is no size of shape = "{shape}", which has {", ".join(allowed)}')
+    for size in [size for size in sizes if size not in allowed][:1]:
+        raise ValueError(f'{size} is no size of shape = "{shape}", which has {", ".join(allowed)}')
     if shape in CIRCLES:
         return _circle(shape, sizes, area)
     return _polygon(shape, sizes, area)
@@ -123,9 +122,8 @@ def cross_section(
 def _without_shape(
     sizes: Mapping[str, float], area: np.ndarray | float | None, second_moment: float | None
 ) -> CrossSection:
-    foreign = [size for size in sizes if size != "diameter"]
-    if foreign:
-        raise ValueError(f"{foreign[0]} needs a shape: {', '.join(SHAPES)}")
+    for size in [size for size in sizes if size != "diameter"][:1]:
+        raise ValueError(f"{size} needs a shape: {', '.join(SHAPES)}")
     refuse_if(area is None, "expected area, area_field, or a shape with its sizes", ValueError)
     radius, moment, modulus = np.sqrt(area / np.pi), 0.0 * area, 0.0 * area
     if second_moment is not None:

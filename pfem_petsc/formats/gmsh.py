@@ -78,8 +78,7 @@ def read(path: Path, fields: Collection[str] | None = None) -> WholeMesh:
     mesh = WholeMesh(points, ends.reshape(-1, 2))
     mesh.node_groups = elements.groups(names[0], len(points), of_points, marked[:, 1])
     mesh.bar_groups = elements.groups(names[1], len(lines), np.arange(len(lines)), lines[:, 3])
-    told = f"{path}: left out {elements.others} elements that are neither lines nor points"
-    mesh.tell(elements.others, told)
+    mesh.tell(elements.others, f"{path}: left out {elements.others} elements that are neither lines nor points")
     for kind, what, tags, found in (
         ("ElementData", "line", lines[:, 0], mesh.bar_fields),
         ("NodeData", "node", node_tags, mesh.node_fields),

@@ -292,8 +292,7 @@ def changed_data(case: CaseModel, changes: Iterable[tuple[KeyPath, Any]]) -> dic
         value = plain(value)
         if path[-1:] == ("initial",) and isinstance(value, list):
             value = _initial(value)
-        parts = [str(part) for part in path]
-        put(data, parts, value, f"{case.source}: {key_text(path)}")
+        put(data, [str(part) for part in path], value, f"{case.source}: {key_text(path)}")
     return data
 
 

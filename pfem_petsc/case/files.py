@@ -376,8 +376,7 @@ def _from_text(path: Path) -> Forces:
             f"column {k} has the heading {file.names[k] or ''!r}: expected NAME.x, NAME.y or NAME.z, with a node "
             "set or a node number as NAME",
         )
-        member = targets.setdefault(_target(match[1]), len(targets))
-        found.append((k, member, "xyz".index(match[2])))
+        found.append((k, targets.setdefault(_target(match[1]), len(targets)), "xyz".index(match[2])))
     refuse_if(not found, "expected the time and columns NAME.x, NAME.y, NAME.z, with a heading")
     refuse_if(len({each[1:] for each in found}) < len(found), "two columns have the same heading")
     times = _checked_times(file.values(0), file.where)

@@ -577,8 +577,9 @@ class LoadFile(StrictModel):
     @classmethod
     def _alone(cls, data: Any) -> Any:
         taken = [key for key in ("node_set", "force", "table", "table_file") if key in data]
-        text = f"file gives the forces of nodes or node sets over time, without {', '.join(taken)}"
-        refuse_if(taken, text, ValueError)
+        refuse_if(
+            taken, f"file gives the forces of nodes or node sets over time, without {', '.join(taken)}", ValueError
+        )
         return data
 
     @model_validator(mode="after")

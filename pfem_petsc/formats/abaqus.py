@@ -183,8 +183,9 @@ def _add_sections(mesh: WholeMesh, deck: Deck) -> None:
         material = block.get("MATERIAL")
         if material:
             found["material"] = deck.materials.get(material.upper(), (material, []))[0]
-            told = f"{block.where}: DENSITY is left out: that of the material is taken"
-            mesh.tell("DENSITY" in block.parameters, told)
+            mesh.tell(
+                "DENSITY" in block.parameters, f"{block.where}: DENSITY is left out: that of the material is taken"
+            )
         elif block.keyword in ("BEAM GENERAL SECTION", "FRAME SECTION"):
             found |= _own_material(mesh, block, rows, group)
         sections[group] = {"bars": group, **found}
@@ -545,8 +546,7 @@ class _Conditions:
         every: list[tuple[np.ndarray, _Rows]] = []
         for (vector, rows), (line, times) in self._gravity.items():
             every.append((times.min() * np.array(vector), rows))
-            uneven = times.max() > times.min()
-            self._mesh.tell(uneven, f"{line} is left out: the gravity of a case acts on all bars")
+            self._mesh.tell(times.max() > times.min(), f"{line} is left out: the gravity of a case acts on all bars")
         total = sum((vector for vector, _ in every), np.zeros(3))
         if not any(rows for _, rows in every):
             return {"gravity": {"acceleration": total.tolist()}} if total.any() else {}
@@ -558,8 +558,7 @@ class _Conditions:
         """Return the temperatures of bars, the means of those of their nodes, above the initial ones."""
         mesh = self._mesh
         initial = np.zeros(len(mesh.points))
-        expected = "expected nodes and a temperature"
-        for members, (value,) in _initial_values(mesh, self._deck, "TEMPERATURE", expected):
+        for members, (value,) in _initial_values(mesh, self._deck, "TEMPERATURE", "expected nodes and a temperature"):
             initial[members] = value
         times = self._times([rows for _, _, rows in self._temperatures])
         above = np.zeros((len(initial), len(times)))

@@ -349,8 +349,7 @@ def _members_of(case: Case, where: str, node_set: NodeSet, mesh: DistributedMesh
         return np.sort(mesh.node_groups[str(node_set.selection)])
     if node_set.indices is not None:
         wanted = np.array(node_set.indices, dtype=np.int64)
-        outside = wanted[(wanted < 0) | (wanted >= mesh.n_nodes)]
-        for node in outside[:1]:
+        for node in wanted[(wanted < 0) | (wanted >= mesh.n_nodes)][:1]:
             raise InputError(f"{where}.indices: node {node} does not exist; the mesh has nodes 0 to {mesh.n_nodes - 1}")
         return np.flatnonzero(np.isin(ids, wanted))
     return np.arange(mesh.n_owned)

@@ -219,8 +219,7 @@ class _Left:
         clear = np.abs(distance).sum(axis=1) > longest
         touching = np.flatnonzero(~clear & (inside.any(axis=1) if clip else inside.all(axis=1)))
         starts, stops = self._end_points(touching)
-        strictly = (distance[touching] < -ON * longest).all(axis=1)
-        line, span = surface.inside_parts(starts, stops, strictly)
+        line, span = surface.inside_parts(starts, stops, (distance[touching] < -ON * longest).all(axis=1))
         entire = (span == (0.0, 1.0)).all(axis=1)
         whole = clear & inside.all(axis=1)
         whole[touching[line[entire]]] = True
@@ -270,8 +269,7 @@ class _Left:
             whole = [self.block.positions(*self.block.end(places, which)) for which in (0, 1)]
             left = self._end_points(cut)
             share[cut] = np.linalg.norm(left[1] - left[0], axis=1) / np.linalg.norm(whole[1] - whole[0], axis=1)
-        own = float(share @ self.block.cell_volumes(at)) / len(self.block.cell.ends)
-        return self._comm.allreduce(own)
+        return self._comm.allreduce(float(share @ self.block.cell_volumes(at)) / len(self.block.cell.ends))
 
     def renumbered(self, wanted: _Wanted) -> MeshSlab:
         """Return this rank's part of what is left. Collective.

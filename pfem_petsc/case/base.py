@@ -54,6 +54,12 @@ def refusal(*problems: tuple[tuple[str | int, ...], str, Any]) -> ValidationErro
     return ValidationError.from_exception_data("case", details)
 
 
+def refuse_key_if(condition: object, path: tuple[str | int, ...], text: str, value: Any = None) -> None:
+    """Refuse a key of the table of a validator, by its path within it, if a condition holds."""
+    if condition:
+        raise refusal((path, text, value))
+
+
 @cache
 def _texts(model: type) -> dict[str, str]:
     """Return the texts below the keys of a model, from its source, which is read only when they are needed."""

@@ -43,6 +43,7 @@ from .base import (
     must,
     refers,
     refusal,
+    refuse_key_if,
 )
 from .files import Columns, TableFile, file_columns, rows_of
 
@@ -70,8 +71,8 @@ class Reading:
 
     def rows(self, given: Any, columns: tuple[str, ...]) -> list[list[float]]:
         """Return the rows of a file: its name, or a table with the key ``file``."""
-        if not isinstance(given, str | Mapping) or given == "":
-            raise refusal(((), "expected the name of a file, or a table with the key file", given))
+        named = isinstance(given, str | Mapping) and given != ""
+        refuse_key_if(not named, (), "expected the name of a file, or a table with the key file", given)
         read = TableFile.model_validate({"file": given} if isinstance(given, str) else given)
         try:
             if read.file not in self._columns:
@@ -105,8 +106,7 @@ class Chosen:
 
     def read(self, table: Any, info: ValidationInfo) -> Any:
         """Validate a table."""
-        if not isinstance(table, Mapping):
-            raise refusal(((), "expected a table", table))
+        refuse_key_if(not isinstance(table, Mapping), (), "expected a table", table)
         return self.validated(self.chosen(table, info), table, info)
 
     def chosen(self, table: Mapping[str, Any], info: ValidationInfo) -> type[StrictModel]:
@@ -164,8 +164,7 @@ class Family(Chosen):
     def model_of(self, table: Mapping[str, Any]) -> type[StrictModel]:
         """Return the ``Parameters`` of the module."""
         name = self.name(table)
-        if name is None:
-            raise refusal(((self.key,), f"this key is missing: {self._missing}", None))
+        refuse_key_if(name is None, (self.key,), f"this key is missing: {self._missing}")
         try:
             return lookup(self.package, name, "").Parameters
         except InputError as error:
@@ -303,9 +302,9 @@ class Time(t.TimeKeys, WithParameters):
     def _known_step(self) -> Time:
         if self.step != "auto" or isinstance(self.scheme, UnknownParameters):
             return self
-        if not lookup(INTEGRATORS, self.integrator, "time.integrator").Scheme.explicit:
-            text = f'"auto" is for explicit schemes, and {self.integrator} is implicit: give the step in seconds'
-            raise refusal((("step",), text, "auto"))
+        text = f'"auto" is for explicit schemes, and {self.integrator} is implicit: give the step in seconds'
+        explicit = lookup(INTEGRATORS, self.integrator, "time.integrator").Scheme.explicit
+        refuse_key_if(not explicit, ("step",), text, "auto")
         return self
 
 
@@ -349,16 +348,15 @@ class _Materials(Family):
             raise refusal(((), text, None))
         known, file = lookup(LAWS, law, "").LAW, added_file(LAWS, law)
         flaw = known.flaw(material, file) if file else ""
-        if flaw:
-            raise refusal((("law",), f"{file}: {flaw}", law))
-        if material.softening is not None and known.softening is None:
-            raise refusal((("softening",), f"the law {law} does not soften by a table; remove the key", None))
+        refuse_key_if(flaw, ("law",), f"{file}: {flaw}", law)
+        softens = material.softening is None or known.softening is not None
+        refuse_key_if(not softens, ("softening",), f"the law {law} does not soften by a table; remove the key")
         variables = [variable for variable, _ in material.choose(known).internal]
         for limit in ("plastic_strain", "damage"):
             value = getattr(material.rupture, limit, None)
-            if value is not None and not any(variable.endswith(limit) for variable in variables):
-                text = f"the law {law} has no {limit.replace('_', ' ')}; use another limit or law"
-                raise refusal((("rupture", limit), text, value))
+            unknown = value is not None and not any(variable.endswith(limit) for variable in variables)
+            text = f"the law {law} has no {limit.replace('_', ' ')}; use another limit or law"
+            refuse_key_if(unknown, ("rupture", limit), text, value)
         return material
 
 
@@ -459,8 +457,8 @@ class LoadCase(StrictModel):
 
     @model_validator(mode="after")
     def _constant_wind(self) -> LoadCase:
-        if self.wind is not None and self.wind.varies:
-            raise refusal((("wind", "velocity"), "a load case takes a constant wind [vx, vy, vz]", None))
+        varies = self.wind is not None and self.wind.varies
+        refuse_key_if(varies, ("wind", "velocity"), "a load case takes a constant wind [vx, vy, vz]")
         return self
 
 
@@ -516,13 +514,10 @@ class CaseModel(StrictModel):
         seen: dict[str | None, str] = {}
         for name, section in sections.items():
             group = None if section.bars is None else str(section.bars)
-            if group not in seen:
-                seen[group] = name
-            elif section.bars is None:
-                text = f"both this section and {seen[None]} name no bars; only one can be the default"
-                raise refusal(((name,), text, None))
-            else:
-                raise refusal(((name, "bars"), f"section {seen[group]} has these bars already", group))
+            other, rest = seen.setdefault(group, name), group is None
+            text = f"both this section and {other} name no bars; only one can be the default"
+            refuse_key_if(rest and other != name, (name,), text)
+            refuse_key_if(other != name, (name, "bars"), f"section {other} has these bars already", group)
         return sections
 
     @field_validator("remove")
@@ -530,8 +525,8 @@ class CaseModel(StrictModel):
     def _removed_once(cls, entries: list[t.Remove]) -> list[t.Remove]:
         targets = [(entry.bars, entry.supports) for entry in entries]
         for i, (bars, supports) in enumerate(targets):
-            if targets[i] in targets[:i]:
-                raise refusal(((i,), f"{str(bars or supports)!r} is removed by an earlier table already", None))
+            text = f"{str(bars or supports)!r} is removed by an earlier table already"
+            refuse_key_if(targets[i] in targets[:i], (i,), text)
         return entries
 
     @field_validator("contact")
@@ -554,10 +549,9 @@ class CaseModel(StrictModel):
         laws = internal_variables(info.data.get("material", {}))
         known = list(dict.fromkeys([*point_fields(), *cell_fields(), *laws]))
         for i, name in enumerate(output.fields or ()):
-            if name not in known and "material" in info.data:
-                raise refusal((("fields", i), f"there is no field of this name{nearest(name, known)}", name))
-            if name in (output.fields or ())[:i]:
-                raise refusal((("fields", i), "this field is listed twice", name))
+            unknown = name not in known and "material" in info.data
+            refuse_key_if(unknown, ("fields", i), f"there is no field of this name{nearest(name, known)}", name)
+            refuse_key_if(name in output.fields[:i], ("fields", i), "this field is listed twice", name)
         return output
 
 

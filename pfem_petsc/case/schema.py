@@ -582,7 +582,9 @@ def stages_of(data: Mapping[str, Any], problems: Problems) -> list[StageTables]:
     for k, row in enumerate(rows):
         if problems.add_if(not isinstance(row, Mapping), ("stage", k), "expected a table", row):
             continue
-        name, taken = _stage_name(row, k, problems), [stage.name for stage in found]
+        name, taken = row.get("name", f"stage{k + 1}"), [stage.name for stage in found]
+        read = problems.validated(StageName, {"name": name}, None, lambda path, k=k: ("stage", k, *path))
+        name = read.name if read is not None else f"stage{k + 1}"
         problems.add_if(name in taken, ("stage", k, "name"), "another stage has this name", name)
         known = ["name", *ANALYSES, *STAGE_TABLES]
         for key in [key for key in row if key not in known]:
@@ -608,12 +610,6 @@ def stages_of(data: Mapping[str, Any], problems: Problems) -> list[StageTables]:
         stressed = tuple(row["section"]) if isinstance(row.get("section"), Mapping) else ()
         found.append(StageTables(name, here, given, stressed, dict(owner)))
     return found
-
-
-def _stage_name(row: Mapping[str, Any], k: int, problems: Problems) -> str:
-    name = row.get("name", f"stage{k + 1}")
-    read = problems.validated(StageName, {"name": name}, None, lambda path: ("stage", k, *path))
-    return read.name if read is not None else f"stage{k + 1}"
 
 
 def _sections(given: Any, common: Any, k: int, problems: Problems) -> Any:
@@ -675,11 +671,13 @@ def load_case_stages(
     keys = [("load_case", k) for k in range(len(model.load_case))]
     keys += [("combination", k) for k in range(len(model.combination))]
     common = {key: value for key, value in last.data.items() if key not in ("modes", *ONE_STAGE)} | {"static": static}
+    rows: list[dict[str, Any]] = []
     try:
-        rows = load_cases.stage_rows(model.load_case, model.combination, load_cases.at_end(start))
+        for row in load_cases.stage_rows(model.load_case, model.combination, load_cases.at_end(start)):
+            rows.append(row)  # one by one: which one cannot be made?
     except load_cases.UnsuitableError as error:
-        named = [row.name for row in (*model.load_case, *model.combination)]
-        problems.add(keys[named.index(error.key)], f"{error.key!r} {error}")
+        wrong = [*model.load_case, *model.combination][len(rows)]
+        problems.add(keys[len(rows)], f"{wrong.name!r} {error}")
         return []
     base = len(stages) + len(made) - 1
     for of, row in zip(keys, rows, strict=True):

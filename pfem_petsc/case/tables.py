@@ -22,6 +22,7 @@ from ..errors import InputError, refuse_if
 from .base import (
     Digest,
     FileName,
+    FilePath,
     Finite,
     Name,
     NodeSetName,
@@ -95,16 +96,12 @@ NO_FRAME = (
 """One of the conflicts of tables with the key ``frame``."""
 
 
-def _path_of(name: str, info: ValidationInfo) -> Path:
-    return Path(name) if info.context is None else Path(info.context.folder, name).resolve()
-
-
 class MeshKeys(StrictModel):
     """The keys of [mesh] other than those of a generator."""
 
     generator: Name | None = None
     """name of a mesh generator"""
-    file: Annotated[FileName, AfterValidator(_path_of), PlainSerializer(str)] | None = None
+    file: Annotated[FilePath, AfterValidator(lambda name: Path(name)), PlainSerializer(str)] | None = None
     """mesh file, relative to the case file"""
 
     @model_validator(mode="after")
@@ -293,10 +290,9 @@ class Section(StrictModel):
             values = profile_of(Path(info.context.folder, data["catalogue"]), data["profile"], list(cls.model_fields))
         except InputError as error:
             raise refusal((("catalogue",), str(error), data["catalogue"])) from error
-        taken = [key for key in values if key in data]
-        if taken:
-            text = f"the profile {data['profile']!r} has this value too: remove it here, or from the catalogue"
-            raise refusal(((taken[0],), text, data[taken[0]]))
+        text = f"the profile {data['profile']!r} has this value too: remove it here, or from the catalogue"
+        for key in [key for key in values if key in data][:1]:
+            raise refusal(((key,), text, data[key]))
         return {key: value for key, value in data.items() if key not in ("catalogue", "profile")} | values
 
     @field_validator("rest_length")

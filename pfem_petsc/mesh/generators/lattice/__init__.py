@@ -111,12 +111,10 @@ def _uncut(block: Block, rank: int, size: int, wanted: _Wanted) -> MeshSlab:
     ends, *marks = block.bars.arrays(bars, of_bars)
     groups = {name: nodes[0] + np.flatnonzero(mark) for name, mark in zip(block.faces, faces)}
     slab = MeshSlab(block.nodes.total, block.bars.total, nodes[0], points, bars[0], ends, groups)
-    slab.bar_groups = {name: bars[0] + np.flatnonzero(mark) for name, mark in zip(wanted.groups, marks)}
-    slab.bar_fields = dict(zip(wanted.fields, marks[len(wanted.groups) :]))
     slab.volume = block.volume if block.keys.map is None else None
     if block.disturbed:
         (slab.undisturbed,) = block.nodes.arrays(nodes, lambda *at: [block.positions(*at, disturbed=False)])
-    return _named(slab, block)
+    return _completed(slab, block, wanted, marks)
 
 
 def _of_bars(block: Block, places: Places, wanted: _Wanted, ends: list[np.ndarray]) -> list[np.ndarray]:
@@ -127,7 +125,10 @@ def _of_bars(block: Block, places: Places, wanted: _Wanted, ends: list[np.ndarra
     return [groups[name] for name in wanted.groups] + fields
 
 
-def _named(slab: MeshSlab, block: Block) -> MeshSlab:
+def _completed(slab: MeshSlab, block: Block, wanted: _Wanted, marks: list[np.ndarray]) -> MeshSlab:
+    """Give a slab what is wanted of its bars, see :func:`_of_bars`, its source and warnings."""
+    slab.bar_groups = {name: slab.first_bar + np.flatnonzero(mark) for name, mark in zip(wanted.groups, marks)}
+    slab.bar_fields = dict(zip(wanted.fields, marks[len(wanted.groups) :]))
     slab.structured = block.keys.map is None  # a map may make nodes of a bar meet
     slab.source = f"generator lattice ({block.keys.kind})"
     slab.warnings = mechanism_warning(block.keys.kind, block.cell)
@@ -311,11 +312,9 @@ class _Left:
         ends, *marks = (moved(rows) for rows in (ends.astype(index_type(total + n_new)), *marks))
         slab = MeshSlab(total + n_new, n_bars, first_node, points, first_bar, ends, groups)
         slab.undisturbed = undisturbed
-        slab.bar_groups = {name: first_bar + np.flatnonzero(mark) for name, mark in zip(wanted.groups, marks)}
-        slab.bar_fields = dict(zip(wanted.fields, marks[len(wanted.groups) :]))
         if keys.keep is None and keys.map is None:  # else it is not known what the lattice fills
             slab.volume = self._surface.volume if self._surface is not None else block.volume
-        _named(slab, block)
+        _completed(slab, block, wanted, marks)
         if self._surface is not None:
             slab.warnings = self._surface.warnings + slab.warnings
             if slab.volume is not None and keys.curved is None and not keys.missing:

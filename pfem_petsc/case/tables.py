@@ -193,6 +193,14 @@ class NodeSet(StrictModel):
 class Rupture(StrictModel):
     """A bar breaks at the end of the step in which it first reaches one of the limits."""
 
+    conflicts = (
+        (
+            lambda own: all(value is None for key, value in own if key != "steps"),
+            "expected at least one limit: stress, strain, compressive_stress, compressive_strain, plastic_strain, "
+            "damage",
+        ),
+    )
+
     stress: PositiveFloat | None = None
     """tensile stress [Pa]"""
     strain: PositiveFloat | None = None
@@ -207,13 +215,6 @@ class Rupture(StrictModel):
     """damage variable of the law"""
     steps: PositiveInt = 1
     """steps over which the force of a broken bar is reduced to zero in equal parts"""
-
-    @model_validator(mode="after")
-    def _at_least_one(self) -> Rupture:
-        limits = [key for key in type(self).model_fields if key != "steps"]
-        none = all(getattr(self, key) is None for key in limits)
-        refuse_if(none, f"expected at least one limit: {', '.join(limits)}", ValueError)
-        return self
 
 
 class Section(StrictModel):
@@ -258,7 +259,16 @@ class Section(StrictModel):
     """axial force in the mesh [N], or rows [t, force] [s, N]: linear between rows, constant outside"""
     prestress: NumberOrRows | None = None
     """stress in the mesh [Pa], or rows [t, stress] [s, Pa]"""
-    rest_length: NumberOrRows | None = None
+    rest_length: (
+        Annotated[
+            NumberOrRows,
+            must(
+                lambda value: all(1e-3 < row[1] < 1e3 for row in (value if has_rows(value) else [[0.0, value]])),
+                "expected a factor on the length in the mesh, like 0.99, or rows [t, factor]",
+            ),
+        ]
+        | None
+    ) = None
     """rest length over the length in the mesh, or rows [t, factor] [s, -]; if constant, mass is that of this length"""
     force_density: NumberOrRows | None = None
     """axial force over length in the mesh [N/m], or rows [t, q] [s, N/m]"""
@@ -294,17 +304,6 @@ class Section(StrictModel):
         for key in [key for key in values if key in data][:1]:
             raise refusal(((key,), text, data[key]))
         return {key: value for key, value in data.items() if key not in ("catalogue", "profile")} | values
-
-    @field_validator("rest_length")
-    @classmethod
-    def _factor(cls, value: Any) -> Any:
-        rows = value if has_rows(value) else [[0.0, value]] if value is not None else []
-        refuse_if(
-            not all(1e-3 < row[1] < 1e3 for row in rows),
-            "expected a factor on the length in the mesh, like 0.99, or rows [t, factor]",
-            ValueError,
-        )
-        return value
 
     @property
     def prestressed(self) -> str | None:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..errors import InputError
+from ..errors import InputError, refuse_if
 
 if TYPE_CHECKING:
     from ..mesh.whole import WholeMesh
@@ -37,6 +37,33 @@ def numbers_of(text: bytes) -> np.ndarray:
         except (DeprecationWarning, ValueError):
             other = next((word for word in text.split() if not _NUMBER.fullmatch(word)), text.strip())
             raise ValueError(f"{shown(other)!r} is not a number") from None
+
+
+class NumberStream:
+    """Numbers of a text, or of binary data with a byte order, taken one after the other; a text has float64 alone."""
+
+    def __init__(self, content: bytes, order: str) -> None:
+        self._order, self._at = order, 0
+        self._all = content if order else numbers_of(content).tobytes()
+
+    @property
+    def left(self) -> int:
+        """How many bytes, of a text numbers, nothing has taken; white space at the end of a file is none."""
+        rest = self._all[self._at :]
+        return len(rest.strip()) if self._order else len(rest) // 8
+
+    def take(self, n: int, *kinds: str) -> np.ndarray:
+        """Return the next n rows of numbers of these types, with the fields ``0``, ``1``, ...
+
+        Raises
+        ------
+        EOFError
+            If there are not as many.
+        """
+        row = np.dtype([(f"{k}", self._order + kind if self._order else "f8") for k, kind in enumerate(kinds)])
+        start, self._at = self._at, self._at + n * row.itemsize
+        refuse_if(not start <= self._at <= len(self._all), "it ends early", EOFError)
+        return np.ndarray((n,), row, self._all, start)
 
 
 def number_of(text: str) -> float:

@@ -329,7 +329,7 @@ def generate_on(
             "alone, by Truss(..., comm=comm)"
         )
     refuse_if(
-        not found[0][1],
+        not found[0][1],  # nobody has, or not the one that would send them
         f"mesh: the arrays of this case (digest {str(digest)[:12]}...) are not in its text, as they are large: "
         "give the truss, as in Case.load(path, mesh=truss)",
     )

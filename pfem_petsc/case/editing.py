@@ -319,12 +319,10 @@ def merge(old: Any, new: Any) -> Any:
             old.__dict__[key] = merge(old.__dict__.get(key), value)
         object.__setattr__(old, "__pydantic_fields_set__", new.__pydantic_fields_set__)
         return old
-    if type(old) is dict:
-        return {name: merge(old.get(name), item) for name, item in new.items()}
-    if isinstance(old, Tables):
-        tables = {name: merge(old.get(name), table) for name, table in new.items()}
+    if isinstance(old, dict):
+        items = {name: merge(old.get(name), item) for name, item in new.items()}
         dict.clear(old)
-        dict.update(old, tables)
+        dict.update(old, items)
         return old
     if isinstance(old, Rows):
         if len(old) == len(new):

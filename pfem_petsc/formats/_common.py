@@ -131,12 +131,9 @@ def edges(pairs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 def drop_bare_nodes(path: Path, mesh: WholeMesh) -> None:
     """Remove nodes where no bar ends from a mesh, and tell their number."""
-    used = np.zeros(len(mesh.points), bool)
-    used[mesh.bars] = True
-    if used.all():
-        return
-    number = np.cumsum(used) - 1
-    mesh.warnings.append(f"{path}: left out {int((~used).sum())} points where no bar ends")
-    mesh.points, mesh.bars = mesh.points[used], number[mesh.bars]
-    mesh.node_groups = {name: number[own[used[own]]] for name, own in mesh.node_groups.items()}
+    used, bars = np.unique(mesh.bars, return_inverse=True)
+    left = len(mesh.points) - len(used)
+    mesh.tell(left, f"{path}: left out {left} points where no bar ends")
+    mesh.points, mesh.bars = mesh.points[used], bars.reshape(-1, 2)
+    mesh.node_groups = {name: np.flatnonzero(np.isin(used, own)) for name, own in mesh.node_groups.items()}
     mesh.node_fields = {name: values[used] for name, values in mesh.node_fields.items()}

@@ -364,10 +364,10 @@ class _Conditions:
     def add(self) -> None:
         """Add the tables to the mesh, and warnings."""
         kinds = {"DLOAD": self._weigh, "CLOAD": self._push, "BOUNDARY": self._hold, "TEMPERATURE": self._heat}
-        steps = [each for each, in_step in self._deck.conditions if in_step]
-        new = [each for each in steps if each.keyword == "BOUNDARY" and each.get("OP").upper() == "NEW"]
+        of_step = [block for block, in_step in self._deck.conditions if in_step and block.keyword == "BOUNDARY"]
+        new = next((block for block in of_step if block.get("OP").upper() == "NEW"), None)
         for block, in_step in self._deck.conditions:
-            if block in new[:1]:
+            if block is new:
                 self._supports.clear()
                 self._held[:] = 0
             self._in_step, self._over = in_step, self._rows(block)

@@ -62,7 +62,8 @@ def read(path: Path, fields: Collection[str] | None = None) -> WholeMesh:
     command = [sys.executable, "-P", "-m", __name__, str(path.resolve())]
     path_of_modules = {"PYTHONPATH": os.pathsep.join(p for p in sys.path if p)}
     done = subprocess.run(command, env=os.environ | path_of_modules, capture_output=True, check=False)
-    refuse_if(done.returncode == _REFUSED, f"{path}: {done.stdout.decode(errors='replace').strip()}")
+    if done.returncode == _REFUSED:
+        raise InputError(f"{path}: {done.stdout.decode(errors='replace').strip()}")
     if done.returncode < 0:
         raise InputError(
             f"{path}: VTK ended with signal {signal.Signals(-done.returncode).name} while reading it; "

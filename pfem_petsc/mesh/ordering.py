@@ -266,7 +266,7 @@ def _by_coordinates(slab: MeshSlab, works: np.ndarray, comm: MPI.Comm) -> np.nda
 
 
 def _border(keys: np.ndarray, works: np.ndarray, share: float, comm: MPI.Comm) -> int:
-    """Return the key up to which nodes, of all ranks, have a share of the work, to half of that of a node. Collective."""
+    """Return the key up to which nodes, of all ranks, have a share of the work, within half of that of a node."""
     order = np.argsort(keys)
     in_order, sums = keys[order], np.concatenate([[0], np.cumsum(works[order])])
     half = 0.5 * comm.allreduce(int(works.max(initial=0)), op=MPI.MAX)

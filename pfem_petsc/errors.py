@@ -20,7 +20,6 @@ __all__ = [
     "numpy_is_too_new",
     "printable",
     "raised",
-    "refuse_if",
     "written",
 ]
 
@@ -77,12 +76,6 @@ class InputError(PfemError):
     """Invalid input, found before the first step: case, mesh, restart file, option, unwritable output."""
 
     exit_status = 2
-
-
-def refuse_if(condition: object, text: str, error: type[Exception] = InputError) -> None:
-    """Raise an error with a text if a condition holds; validators of keys raise ValueError."""
-    if condition:
-        raise error(text)
 
 
 class SimulationFailure(PfemError):

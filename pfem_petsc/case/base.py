@@ -30,7 +30,6 @@ from pydantic import (
 from pydantic.types import Strict
 from pydantic_core import InitErrorDetails, PydanticCustomError
 
-from ..errors import refuse_if
 from ..registry import nearest
 
 
@@ -52,12 +51,6 @@ def refusal(*problems: tuple[tuple[str | int, ...], str, Any]) -> ValidationErro
         for path, text, value in problems
     ]
     return ValidationError.from_exception_data("case", details)
-
-
-def refuse_key_if(condition: object, path: tuple[str | int, ...], text: str, value: Any = None) -> None:
-    """Refuse a key of the table of a validator, by its path within it, if a condition holds."""
-    if condition:
-        raise refusal((path, text, value))
 
 
 @cache
@@ -106,10 +99,12 @@ class StrictModel(BaseModel):
             for keys in groups:
                 given = [key for key in keys if getattr(self, key) is not None]
                 text = f"expected {many} one of the keys {', '.join(keys)}, got {' and '.join(given) or 'none'}"
-                refuse_if(not least <= len(given) <= 1, text, ValueError)
+                if not least <= len(given) <= 1:
+                    raise ValueError(text)
         for kind in reversed(type(self).__mro__):
             for test, text in kind.__dict__.get("conflicts", ()):
-                refuse_if(test(self), text.format(self), ValueError)
+                if test(self):
+                    raise ValueError(text.format(self))
         return self
 
     def __setattr__(self, key: str, value: Any) -> None:
@@ -159,7 +154,8 @@ def must(test: Callable[[Any], object], text: str) -> AfterValidator:
     """Annotation of a key whose value must pass a test, with the message of one that does not."""
 
     def check(value: Any) -> Any:
-        refuse_if(not test(value), text, ValueError)
+        if not test(value):
+            raise ValueError(text)
         return value
 
     return AfterValidator(check)
@@ -222,7 +218,8 @@ Rows = TypeVar("Rows", bound=Sequence[Sequence[float]])
 
 def increasing(rows: Rows) -> Rows:
     """Return the rows of a table over time; reject it if it is empty or its times do not increase."""
-    refuse_if(not rows, "expected at least one row", ValueError)
+    if not rows:
+        raise ValueError("expected at least one row")
     for k in range(1, len(rows)):
         if rows[k][0] <= rows[k - 1][0]:
             raise ValueError(f"times must increase, but row {k} has t = {rows[k][0]!r} after {rows[k - 1][0]!r}")
@@ -290,7 +287,8 @@ class WithFiles(StrictModel):
             if name in data:
                 exclusive = [*keys, *(f"{each}_file" for each in keys), *cls.alternatives]
                 taken = [other for other in exclusive if other in data and other != name]
-                refuse_if(taken, f"expected at most one of the keys {name}, {', '.join(taken)}", ValueError)
+                if taken:
+                    raise ValueError(f"expected at most one of the keys {name}, {', '.join(taken)}")
                 read = _FILES.validate_python({name: (data[name], cls.COLUMNS[key])}, context=info.context)
                 return {other: value for other, value in data.items() if other != name} | {key: read[name]}
         return data

@@ -12,7 +12,7 @@ import tomllib
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple, TypeVar
 
-from ..errors import InputError, refuse_if
+from ..errors import InputError
 from ..registry import nearest
 from .base import StrictModel
 from .model import ANALYSES, LISTS, NUMBERED, ONE_STAGE, CaseModel, StageOutput, shape_of
@@ -44,13 +44,10 @@ def apply_overrides(data: dict[str, Any], overrides: Iterable[str]) -> list[KeyP
     for text in overrides:
         key, equals, value = text.partition("=")
         parts = split_key(key.strip())
-        refuse_if(
-            parts is not None and len(parts) > DEEPEST, f"--set {text[:40]} ...: a key of more than {DEEPEST} parts"
-        )
-        refuse_if(
-            not equals or parts is None,
-            f"--set {text}: expected KEY=VALUE, like time.step=1e-5 or wall.0.point=[1.0, 0.0, 0.0]",
-        )
+        if parts is not None and len(parts) > DEEPEST:
+            raise InputError(f"--set {text[:40]} ...: a key of more than {DEEPEST} parts")
+        if not equals or parts is None:
+            raise InputError(f"--set {text}: expected KEY=VALUE, like time.step=1e-5 or wall.0.point=[1.0, 0.0, 0.0]")
         where = f"--set {text}"
         found = _value(value.strip(), where) if value.strip() else None
         path = put(data, parts, found, where)
@@ -97,11 +94,11 @@ def _place_of(rows: list[Any], part: str, table: str, where: str) -> int:
     found = [k for k, name in enumerate(names) if name == part]
     if len(found) == 1:
         return found[0]
-    refuse_if(
-        found,
-        f"{where}: {len(found)} entries of {table} have the name {part!r}: give an index, "
-        f"{' or '.join(map(str, found))}",
-    )
+    if found:
+        raise InputError(
+            f"{where}: {len(found)} entries of {table} have the name {part!r}: give an index, "
+            f"{' or '.join(map(str, found))}"
+        )
     known = [name for name in names if isinstance(name, str)]
     if known:
         raise InputError(
@@ -138,7 +135,8 @@ def put(data: dict[str, Any], parts: Sequence[str], value: Any, where: str) -> K
         if key not in (range(len(here)) if isinstance(here, list) else here):
             if value is None:
                 return path
-            refuse_if(isinstance(here, list) and key > len(here), _no_index(part, here, where))
+            if isinstance(here, list) and key > len(here):
+                raise InputError(_no_index(part, here, where))
             if isinstance(here, list):
                 here.append({})
             else:
@@ -271,10 +269,8 @@ def _stage(case: CaseModel, stage: CaseModel, given: bool) -> dict[str, Any]:
 def _initial(entries: Sequence[Any]) -> dict[str, Any]:
     """Return the table [initial] of a list of its entries."""
     everywhere = [entry for entry in entries if not isinstance(entry, Mapping) or "node_set" not in entry]
-    refuse_if(
-        len(everywhere) > 1 or not all(isinstance(entry, Mapping) for entry in everywhere),
-        "initial: expected tables, at most one of which has no node_set",
-    )
+    if len(everywhere) > 1 or not all(isinstance(entry, Mapping) for entry in everywhere):
+        raise InputError("initial: expected tables, at most one of which has no node_set")
     on = [entry for entry in entries if "node_set" in entry]
     return {**(everywhere[0] if everywhere else {}), **({"on": on} if on else {})}
 
@@ -305,7 +301,8 @@ def key_path(case: CaseModel, key: str) -> KeyPath:
         If it is malformed.
     """
     parts = split_key(key) if isinstance(key, str) else None
-    refuse_if(parts is None, f"{case.source}: {key!r}: expected a key like time.step or wall[0].point")
+    if parts is None:
+        raise InputError(f"{case.source}: {key!r}: expected a key like time.step or wall[0].point")
     parts[0] = "mass" if parts[0] == "point_mass" else parts[0]
     return tuple(int(part) if part.isascii() and part.isdigit() else part for part in parts)
 

@@ -19,7 +19,7 @@ from typing import Annotated, NamedTuple
 
 import numpy as np
 
-from ..errors import InputError, refuse_if
+from ..errors import InputError
 from ..files import check_contents, readable_whole
 from ..registry import nearest
 from .base import FileName, Finite, PositiveFloat, StrictModel, listed, refusal
@@ -51,16 +51,15 @@ class Columns:
             If there is none, or several have the name.
         """
         if isinstance(column, int):
-            refuse_if(
-                not 0 <= column < self.count,
-                f"column {column} does not exist: the file has the columns 0 to {self.count - 1}",
-            )
+            if not 0 <= column < self.count:
+                raise InputError(f"column {column} does not exist: the file has the columns 0 to {self.count - 1}")
             return column
         number = self.named.count(column)
         if number == 0:
             hint = nearest(column, self.named) if self.named else "; its columns have no names: give numbers, from 0"
             raise InputError(f"there is no column {column!r}{hint}")
-        refuse_if(number > 1, f"there are {number} columns {column!r}; give numbers, from 0")
+        if number > 1:
+            raise InputError(f"there are {number} columns {column!r}; give numbers, from 0")
         return self.names.index(column)
 
     def values(self, column: str | int) -> np.ndarray:
@@ -116,10 +115,8 @@ def _array_columns(path: Path) -> Columns:
         for k, column in enumerate(array.T if several else [array]):
             names.append((f"{name}[{k}]" if several else name) if name else None)
             columns.append(np.asarray(column, dtype=np.float64))
-    refuse_if(
-        not any(len(column) for column in columns),
-        "this file has no columns of numbers: expected arrays (n,) or (n, k)",
-    )
+    if not any(len(column) for column in columns):
+        raise InputError("this file has no columns of numbers: expected arrays (n,) or (n, k)")
     return Columns(names, lambda k: columns[k], lambda row: f"row {row}")
 
 
@@ -165,7 +162,8 @@ def _text_columns(text: str) -> Columns:
             )
         rows.append(words)
         numbers.append(number)
-    refuse_if(not rows, "this file has no rows")
+    if not rows:
+        raise InputError("this file has no rows")
     names = heading if len(heading) == len(rows[0]) else [None] * len(rows[0])
 
     def values(k: int) -> np.ndarray:
@@ -209,7 +207,8 @@ def rows_of(given: TableFile, file: Columns, names: tuple[str, ...]) -> list[lis
             f"{file.where(k)}: expected {_COUNTS[len(names)]} finite numbers {', '.join(names)}, got {shown}"
         )
     _checked_times(found[0], file.where)
-    refuse_if(not len(found[0]), "this file has no rows")
+    if not len(found[0]):
+        raise InputError("this file has no rows")
     times, values = given.time_scale * found[0] + given.time_offset, given.scale * found[1:] + given.offset
     return np.vstack([times, values]).T.tolist()
 
@@ -222,20 +221,20 @@ def _chosen(file: Columns, columns: tuple[str | int, ...] | None, names: tuple[s
     listed_names = ", ".join(names)
     if columns is None:
         shown = f" ({', '.join(file.named)[:60]})" if file.named else ""
-        refuse_if(
-            file.count != len(names),
-            f"{file.where(0)}: expected {_COUNTS[len(names)]} finite numbers {listed_names}, got {file.count} "
-            f"columns{shown}; choose columns by columns = [...]",
-        )
+        if file.count != len(names):
+            raise InputError(
+                f"{file.where(0)}: expected {_COUNTS[len(names)]} finite numbers {listed_names}, got {file.count} "
+                f"columns{shown}; choose columns by columns = [...]"
+            )
         columns = tuple(range(file.count))
-    refuse_if(len(columns) != len(names), f"columns = {list(columns)}: expected {len(names)} columns, {listed_names}")
-    refuse_if(columns[0] == "", 'columns: the first column is the time, and cannot be ""')
+    if len(columns) != len(names):
+        raise InputError(f"columns = {list(columns)}: expected {len(names)} columns, {listed_names}")
+    if columns[0] == "":
+        raise InputError('columns: the first column is the time, and cannot be ""')
     found = [None if column == "" else file.values(column) for column in columns]
     given = [array for array in found if array is not None]
-    refuse_if(
-        len({len(array) for array in given}) > 1,
-        f"the columns {list(columns)} have {[len(array) for array in given]} rows",
-    )
+    if len({len(array) for array in given}) > 1:
+        raise InputError(f"the columns {list(columns)} have {[len(array) for array in given]} rows")
     return np.array([np.zeros(len(given[0])) if array is None else array for array in found])
 
 
@@ -314,52 +313,58 @@ def read_forces(path: Path, digest: str) -> Forces:
     InputError
         If the file has changed, or is not as expected; the message does not name file and key.
     """
-    refuse_if(
-        digest_of(path) != digest,
-        f"this file is not the one that the case was made with (digest {digest[:12]}...): restore it, or start a "
-        "new run without the key digest",
-    )
+    if digest_of(path) != digest:
+        raise InputError(
+            f"this file is not the one that the case was made with (digest {digest[:12]}...): restore it, or start a "
+            "new run without the key digest"
+        )
     if not zipfile.is_zipfile(path):
         return _from_text(path)
     arrays = _arrays(path)
     for name, array in arrays.items():
-        refuse_if(array.dtype.kind not in "fiu", f"array {name!r} has the type {array.dtype}: expected numbers")
+        if array.dtype.kind not in "fiu":
+            raise InputError(f"array {name!r} has the type {array.dtype}: expected numbers")
     return _from_arrays(arrays)
 
 
 def _from_arrays(arrays: dict[str, np.ndarray]) -> Forces:
     if "force" not in arrays and "nodes" not in arrays:
         names = [name for name in arrays if name != "time"]
-        refuse_if(not names, "expected the arrays time, nodes, force, or time and one array (n, 3) for each node set")
+        if not names:
+            raise InputError("expected the arrays time, nodes, force, or time and one array (n, 3) for each node set")
         times = _times(arrays)
         force = np.stack([_array(arrays, name, (len(times), 3)) for name in names], axis=1)
         return _histories(times, [_target(name) for name in names], force)
     for name in ("force", "nodes"):
-        refuse_if(name not in arrays, f"there is no array {name!r}; the file has {', '.join(arrays)}")
+        if name not in arrays:
+            raise InputError(f"there is no array {name!r}; the file has {', '.join(arrays)}")
     for name in [name for name in arrays if name not in ("time", "nodes", "force", "factor")][:1]:
         raise InputError(f"there is an unknown array {name!r}; expected time, nodes, force, factor")
     nodes = arrays["nodes"]
-    refuse_if(
-        nodes.ndim != 1 or nodes.dtype.kind not in "iu" or not len(nodes), "array 'nodes': expected node numbers (m,)"
-    )
-    refuse_if(len(np.unique(nodes)) < len(nodes), "array 'nodes': a node number is listed twice")
+    if nodes.ndim != 1 or nodes.dtype.kind not in "iu" or not len(nodes):
+        raise InputError("array 'nodes': expected node numbers (m,)")
+    if len(np.unique(nodes)) < len(nodes):
+        raise InputError("array 'nodes': a node number is listed twice")
     every, targets = np.arange(len(nodes)), nodes.tolist()
     if arrays["force"].ndim == 3:
-        refuse_if("factor" in arrays, "array 'factor' requires forces (m, 3)")
+        if "factor" in arrays:
+            raise InputError("array 'factor' requires forces (m, 3)")
         times = _times(arrays)
         return _histories(times, targets, _array(arrays, "force", (len(times), len(nodes), 3)))
     force = _array(arrays, "force", (len(nodes), 3))
     if "factor" in arrays:
         times = _times(arrays)
         return Forces(times, targets, _array(arrays, "factor", (len(times), len(nodes))), every, every, force)
-    refuse_if("time" in arrays, "array 'time' needs forces (n, m, 3), or an array factor (n, m)")
+    if "time" in arrays:
+        raise InputError("array 'time' needs forces (n, m, 3), or an array factor (n, m)")
     return Forces(np.zeros(1), targets, np.ones((1, 1)), np.zeros_like(every), every, force)
 
 
 def _array(arrays: dict[str, np.ndarray], name: str, shape: tuple[int, ...]) -> np.ndarray:
     """Return an array of finite numbers of a shape."""
     array = np.asarray(arrays[name], dtype=np.float64)
-    refuse_if(array.shape != shape, f"array {name!r} has the shape {array.shape}: expected {shape}")
+    if array.shape != shape:
+        raise InputError(f"array {name!r} has the shape {array.shape}: expected {shape}")
     for entry in np.argwhere(~np.isfinite(array))[:1].tolist():
         raise InputError(f"array {name!r}: entry {entry} is not finite")
     return array
@@ -371,14 +376,16 @@ def _from_text(path: Path) -> Forces:
     found: list[tuple[int, int, int]] = []
     for k in range(1, file.count):
         match = _COMPONENT.fullmatch(file.names[k] or "")
-        refuse_if(
-            match is None,
-            f"column {k} has the heading {file.names[k] or ''!r}: expected NAME.x, NAME.y or NAME.z, with a node "
-            "set or a node number as NAME",
-        )
+        if match is None:
+            raise InputError(
+                f"column {k} has the heading {file.names[k] or ''!r}: expected NAME.x, NAME.y or NAME.z, with a node "
+                "set or a node number as NAME"
+            )
         found.append((k, targets.setdefault(_target(match[1]), len(targets)), "xyz".index(match[2])))
-    refuse_if(not found, "expected the time and columns NAME.x, NAME.y, NAME.z, with a heading")
-    refuse_if(len({each[1:] for each in found}) < len(found), "two columns have the same heading")
+    if not found:
+        raise InputError("expected the time and columns NAME.x, NAME.y, NAME.z, with a heading")
+    if len({each[1:] for each in found}) < len(found):
+        raise InputError("two columns have the same heading")
     times = _checked_times(file.values(0), file.where)
     values = np.array([file.values(k) for k, _, _ in found]).T
     for row in np.flatnonzero(~np.isfinite(values).all(axis=1))[:1].tolist():
@@ -399,9 +406,11 @@ def _histories(times: np.ndarray, targets: list[int | str], force: np.ndarray) -
 
 
 def _times(arrays: dict[str, np.ndarray]) -> np.ndarray:
-    refuse_if("time" not in arrays, f"there is no array 'time'; the file has {', '.join(arrays)}")
+    if "time" not in arrays:
+        raise InputError(f"there is no array 'time'; the file has {', '.join(arrays)}")
     times = np.asarray(arrays["time"], dtype=np.float64)
-    refuse_if(times.ndim != 1 or not len(times), "array 'time': expected times (n,)")
+    if times.ndim != 1 or not len(times):
+        raise InputError("array 'time': expected times (n,)")
     return _checked_times(times, lambda row: f"row {row}")
 
 
@@ -433,17 +442,16 @@ def profile_of(path: Path, profile: str, keys: Sequence[str]) -> dict[str, float
     lines = [line for line in text.splitlines() if line.strip() and not line.startswith("#")]
     separator = max(",;\t", key=lines[0].count) if lines else ","
     rows = [[cell.strip() for cell in row] for row in csv.reader(lines, delimiter=separator)]
-    refuse_if(
-        not rows or "profile" not in rows[0],
-        "expected a heading with the column profile, and columns named by keys of sections",
-    )
+    if not rows or "profile" not in rows[0]:
+        raise InputError("expected a heading with the column profile, and columns named by keys of sections")
     heading, *profiles = rows
     for column in [column for column in heading if column not in ("profile", *keys)][:1]:
         raise InputError(f"column {column!r} is no key of a section{nearest(column, list(keys))}")
     for row in [row for row in profiles if len(row) != len(heading)][:1]:
         raise InputError(f"the line {separator.join(row)!r} has {len(row)} cells, the heading {len(heading)}")
     named = [dict(zip(heading, row)) for row in profiles if row[heading.index("profile")] == profile]
-    refuse_if(len(named) > 1, f"{len(named)} profiles are called {profile!r}")
+    if len(named) > 1:
+        raise InputError(f"{len(named)} profiles are called {profile!r}")
     if not named:
         known = [row[heading.index("profile")] for row in profiles]
         raise InputError(f"no profile is called {profile!r}{nearest(profile, known)}")

@@ -11,7 +11,6 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
-from ..errors import refuse_if
 from .base import has_rows
 
 PERMANENT = "permanent"
@@ -89,7 +88,8 @@ def _scaled(tables: Mapping[str, Any], factor: float) -> dict[str, Any]:
     for key, value in tables.items():
         if key == "wind":  # its drag is proportional to the density
             text = f"a wind cannot have the factor {factor:g} < 0: turn its velocity"
-            refuse_if(factor < 0.0, text, UnsuitableError)
+            if factor < 0.0:
+                raise UnsuitableError(text)
             made[key] = {**value, "density": factor * value["density"]}
         elif key == "gravity":
             made[key] = {**value, "acceleration": _times(value["acceleration"], factor)}
@@ -100,7 +100,8 @@ def _scaled(tables: Mapping[str, Any], factor: float) -> dict[str, Any]:
 
 def _scaled_row(key: str, row: Mapping[str, Any], factor: float) -> dict[str, Any]:
     text = "a support with acceleration cannot be combined: give its motion"
-    refuse_if(key == "support" and row.get("acceleration") is not None, text, UnsuitableError)
+    if key == "support" and row.get("acceleration") is not None:
+        raise UnsuitableError(text)
     scaled = dict(row)
     for of in {"load": ("force",), "temperature": ("value", "table"), "support": ("motion", "velocity")}[key]:
         if row.get(of) is not None:
@@ -142,7 +143,8 @@ def _joined(common: Mapping[str, Any], parts: Mapping[str, Mapping[str, Any]]) -
 def _gravity(tables: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     accelerations = [table["acceleration"] for table in tables]
     text = "adds a gravity with rows to another gravity: give constant accelerations"
-    refuse_if(len(tables) > 1 and any(map(has_rows, accelerations)), text, UnsuitableError)
+    if len(tables) > 1 and any(map(has_rows, accelerations)):
+        raise UnsuitableError(text)
     if len(tables) == 1:
         return dict(tables[0])
     return {"acceleration": [sum(each) for each in zip(*accelerations, strict=True)]}
@@ -155,7 +157,8 @@ def _supports(common: Sequence[Mapping[str, Any]], given: Sequence[Sequence[Any]
     for row in [row for each in given for row in each]:
         key = f"name {row['name']}" if row.get("name") else f"node set {row['node_set']}"
         text = f"moves the support of {key} in two load cases: give one that moves it"
-        refuse_if(key in taken, text, UnsuitableError)
+        if key in taken:
+            raise UnsuitableError(text)
         same = "name" if row.get("name") else "node_set"
         found = next((k for k, other in enumerate(rows) if other.get(same) == row[same]), len(rows))
         taken[key] = dict(row)

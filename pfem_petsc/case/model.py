@@ -43,7 +43,6 @@ from .base import (
     must,
     refers,
     refusal,
-    refuse_key_if,
 )
 from .files import Columns, TableFile, file_columns, rows_of
 
@@ -72,7 +71,8 @@ class Reading:
     def rows(self, given: Any, columns: tuple[str, ...]) -> list[list[float]]:
         """Return the rows of a file: its name, or a table with the key ``file``."""
         named = isinstance(given, str | Mapping) and given != ""
-        refuse_key_if(not named, (), "expected the name of a file, or a table with the key file", given)
+        if not named:
+            raise refusal(((), "expected the name of a file, or a table with the key file", given))
         read = TableFile.model_validate({"file": given} if isinstance(given, str) else given)
         try:
             if read.file not in self._columns:
@@ -106,7 +106,8 @@ class Chosen:
 
     def read(self, table: Any, info: ValidationInfo) -> Any:
         """Validate a table."""
-        refuse_key_if(not isinstance(table, Mapping), (), "expected a table", table)
+        if not isinstance(table, Mapping):
+            raise refusal(((), "expected a table", table))
         return self.validated(self.chosen(table, info), table, info)
 
     def chosen(self, table: Mapping[str, Any], info: ValidationInfo) -> type[StrictModel]:
@@ -164,7 +165,8 @@ class Family(Chosen):
     def model_of(self, table: Mapping[str, Any]) -> type[StrictModel]:
         """Return the ``Parameters`` of the module."""
         name = self.name(table)
-        refuse_key_if(name is None, (self.key,), f"this key is missing: {self._missing}")
+        if name is None:
+            raise refusal(((self.key,), f"this key is missing: {self._missing}", None))
         try:
             return lookup(self.package, name, "").Parameters
         except InputError as error:
@@ -304,7 +306,8 @@ class Time(t.TimeKeys, WithParameters):
             return self
         text = f'"auto" is for explicit schemes, and {self.integrator} is implicit: give the step in seconds'
         explicit = lookup(INTEGRATORS, self.integrator, "time.integrator").Scheme.explicit
-        refuse_key_if(not explicit, ("step",), text, "auto")
+        if not explicit:
+            raise refusal((("step",), text, "auto"))
         return self
 
 
@@ -348,15 +351,18 @@ class _Materials(Family):
             raise refusal(((), text, None))
         known, file = lookup(LAWS, law, "").LAW, added_file(LAWS, law)
         flaw = known.flaw(material, file) if file else ""
-        refuse_key_if(flaw, ("law",), f"{file}: {flaw}", law)
+        if flaw:
+            raise refusal((("law",), f"{file}: {flaw}", law))
         softens = material.softening is None or known.softening is not None
-        refuse_key_if(not softens, ("softening",), f"the law {law} does not soften by a table; remove the key")
+        if not softens:
+            raise refusal((("softening",), f"the law {law} does not soften by a table; remove the key", None))
         variables = [variable for variable, _ in material.choose(known).internal]
         for limit in ("plastic_strain", "damage"):
             value = getattr(material.rupture, limit, None)
             unknown = value is not None and not any(variable.endswith(limit) for variable in variables)
             text = f"the law {law} has no {limit.replace('_', ' ')}; use another limit or law"
-            refuse_key_if(unknown, ("rupture", limit), text, value)
+            if unknown:
+                raise refusal((("rupture", limit), text, value))
         return material
 
 
@@ -458,7 +464,8 @@ class LoadCase(StrictModel):
     @model_validator(mode="after")
     def _constant_wind(self) -> LoadCase:
         varies = self.wind is not None and self.wind.varies
-        refuse_key_if(varies, ("wind", "velocity"), "a load case takes a constant wind [vx, vy, vz]")
+        if varies:
+            raise refusal((("wind", "velocity"), "a load case takes a constant wind [vx, vy, vz]", None))
         return self
 
 
@@ -516,8 +523,10 @@ class CaseModel(StrictModel):
             group = None if section.bars is None else str(section.bars)
             other, rest = seen.setdefault(group, name), group is None
             text = f"both this section and {other} name no bars; only one can be the default"
-            refuse_key_if(rest and other != name, (name,), text)
-            refuse_key_if(other != name, (name, "bars"), f"section {other} has these bars already", group)
+            if rest and other != name:
+                raise refusal(((name,), text, None))
+            if other != name:
+                raise refusal(((name, "bars"), f"section {other} has these bars already", group))
         return sections
 
     @field_validator("remove")
@@ -526,7 +535,8 @@ class CaseModel(StrictModel):
         targets = [(entry.bars, entry.supports) for entry in entries]
         for i, (bars, supports) in enumerate(targets):
             text = f"{str(bars or supports)!r} is removed by an earlier table already"
-            refuse_key_if(targets[i] in targets[:i], (i,), text)
+            if targets[i] in targets[:i]:
+                raise refusal(((i,), text, None))
         return entries
 
     @field_validator("contact")
@@ -550,8 +560,10 @@ class CaseModel(StrictModel):
         known = list(dict.fromkeys([*point_fields(), *cell_fields(), *laws]))
         for i, name in enumerate(output.fields or ()):
             unknown = name not in known and "material" in info.data
-            refuse_key_if(unknown, ("fields", i), f"there is no field of this name{nearest(name, known)}", name)
-            refuse_key_if(name in output.fields[:i], ("fields", i), "this field is listed twice", name)
+            if unknown:
+                raise refusal((("fields", i), f"there is no field of this name{nearest(name, known)}", name))
+            if name in output.fields[:i]:
+                raise refusal((("fields", i), "this field is listed twice", name))
         return output
 
 

@@ -52,12 +52,6 @@ class Problems:
         if line not in self.lines:
             self.lines.append(line)
 
-    def add_if(self, condition: object, path: KeyPath, message: str, value: Any = None) -> bool:
-        """Add a problem if a condition holds, and return whether it does."""
-        if condition:
-            self.add(path, message, value)
-        return bool(condition)
-
     def raise_if_any(self) -> None:
         """Raise one :class:`InputError` with every problem on its own line."""
         if not self.lines:

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, Self
 
-from ..errors import InputError, refuse_if
+from ..errors import InputError
 from ..mechanics.materials.base import law_of
 from ..registry import add_plugin, has_plugin, nearest
 from . import load_cases
@@ -357,11 +357,11 @@ class Case(_Tables):
         settle(self)
 
     def _check_not_fixed(self) -> None:
-        refuse_if(
-            self.fixed,
-            f"{self.source}: the case of a simulation cannot be changed; change the case that it was made from, "
-            "and make another simulation",
-        )
+        if self.fixed:
+            raise InputError(
+                f"{self.source}: the case of a simulation cannot be changed; change the case that it was made from, "
+                "and make another simulation"
+            )
 
     def update(self, changes: Mapping[str, Any] | None = None, /, **named: Any) -> None:
         """Make several changes, and validate them together.
@@ -439,7 +439,8 @@ def _spread_damping(data: dict[str, Any], problems: Problems) -> None:
             continue
         for key in ("damping", "stiffness_damping"):
             text = "[damping] gives each material its damping: remove this key, or that table"
-            problems.add_if(material.get(key), ("material", name, key), text, material.get(key))
+            if material.get(key):
+                problems.add(("material", name, key), text, material.get(key))
         density = material.get("density")
         if is_finite_number(density):  # else it is refused
             material |= {"damping": of_mass * density, "stiffness_damping": of_stiffness}
@@ -455,15 +456,12 @@ def _validated(
     for key in [key for key in data if key not in KEYS]:
         problems.add((key,), f"unknown key{_hint(key, [*KEYS, 'damping'])}")
     for key in ("material", "section"):
-        problems.add_if(data.get(key, {}) == {}, (), f"no [{key}.NAME] is given: a case needs at least one {key}")
-    problems.add_if(
-        all(key in data for key in ANALYSES), (), "[time] and [static] exclude each other: give one of them"
-    )
-    problems.add_if(
-        not any(key in data for key in (*ANALYSES, "stage", "modes")),
-        (),
-        "the table [time] is missing, or one of [static], [[stage]], [modes], which give the analysis",
-    )
+        if data.get(key, {}) == {}:
+            problems.add((), f"no [{key}.NAME] is given: a case needs at least one {key}")
+    if all(key in data for key in ANALYSES):
+        problems.add((), "[time] and [static] exclude each other: give one of them")
+    if not any(key in data for key in (*ANALYSES, "stage", "modes")):
+        problems.add((), "the table [time] is missing, or one of [static], [[stage]], [modes], which give the analysis")
     # [[stage]] is checked by stages_of, which refuses an analysis beside it
     elsewhere = ("stage", *ANALYSES) if "stage" in data else ()
     known = {key: value for key, value in data.items() if key in KEYS and value is not None and key not in elsewhere}
@@ -476,26 +474,27 @@ def _check_sections(model: CaseModel, stages: list[CaseModel], problems: Problem
     for name, section in model.section.items():
         for key in ("drag_coefficient",) if section.shape is not None else ("diameter", "drag_coefficient"):
             text, value = "has an effect in wind alone: remove the key, or give [wind]", getattr(section, key)
-            problems.add_if(value is not None and not wind, ("section", name, key), text, value)
+            if value is not None and not wind:
+                problems.add(("section", name, key), text, value)
         material = model.material.get(section.material)
         if material is None or law_of(material).bar_data:  # whose law may use the shape
             continue
         warned = not material.describes_buckling and (section.shape is not None or section.second_moment is not None)
-        problems.add_if(
-            section.effective_length != 1.0 and not warned,
-            ("section", name, "effective_length"),
-            "has no effect: bars of this material and section are not checked for buckling; remove the key",
-            section.effective_length,
-        )
+        if section.effective_length != 1.0 and not warned:
+            problems.add(
+                ("section", name, "effective_length"),
+                "has no effect: bars of this material and section are not checked for buckling; remove the key",
+                section.effective_length,
+            )
         path = ("section", name, "thickness")
         follows = section.area is None and section.area_field is None  # from the sizes
-        problems.add_if(
-            path in problems.overridden and not follows and not wind,
-            path,
-            "changes no result: stiffness and mass follow from area, and the law does not buckle; change area, or "
-            "give diameter instead of it",
-            section.thickness,
-        )
+        if path in problems.overridden and not follows and not wind:
+            problems.add(
+                path,
+                "changes no result: stiffness and mass follow from area, and the law does not buckle; change area, or "
+                "give diameter instead of it",
+                section.thickness,
+            )
 
 
 def _add_plugins(given: Any, folder: Path, problems: Problems) -> None:
@@ -515,14 +514,10 @@ def _hint(key: str, known: Iterable[str]) -> str:
 
 def _checked_name(name: Any, source: str) -> str:
     """Return the name of a case, which is the default folder of its results below ``results``."""
-    refuse_if(
-        not isinstance(name, str) or not name.strip() or "\0" in name,
-        f"{source}: name = {name!r:.60}: expected a text, the default folder of the results",
-    )
-    refuse_if(
-        name.startswith("/") or ".." in name.split("/"),
-        f"{source}: name = {name!r:.60}: expected the name of a folder below results",
-    )
+    if not isinstance(name, str) or not name.strip() or "\0" in name:
+        raise InputError(f"{source}: name = {name!r:.60}: expected a text, the default folder of the results")
+    if name.startswith("/") or ".." in name.split("/"):
+        raise InputError(f"{source}: name = {name!r:.60}: expected the name of a folder below results")
     return name
 
 
@@ -568,7 +563,8 @@ def stages_of(data: Mapping[str, Any], problems: Problems) -> list[StageTables]:
     """The stages of a case's nested tables; rejected ones are reported in ``problems`` and left out."""
     rows = data["stage"]
     text = "expected a list of at least one table, each under a heading [[stage]]"
-    if problems.add_if(not isinstance(rows, list) or not rows, ("stage",), text, rows):
+    if not isinstance(rows, list) or not rows:
+        problems.add(("stage",), text, rows)
         return []
     for key in [key for key in ANALYSES if key in data]:
         having = [f"stage[{k}].{key}" for k, row in enumerate(rows) if isinstance(row, Mapping) and key in row]
@@ -580,12 +576,14 @@ def stages_of(data: Mapping[str, Any], problems: Problems) -> list[StageTables]:
     owner: dict[str, int] = {}
     found: list[StageTables] = []
     for k, row in enumerate(rows):
-        if problems.add_if(not isinstance(row, Mapping), ("stage", k), "expected a table", row):
+        if not isinstance(row, Mapping):
+            problems.add(("stage", k), "expected a table", row)
             continue
         name, taken = row.get("name", f"stage{k + 1}"), [stage.name for stage in found]
         read = problems.validated(StageName, {"name": name}, None, lambda path, k=k: ("stage", k, *path))
         name = read.name if read is not None else f"stage{k + 1}"
-        problems.add_if(name in taken, ("stage", k, "name"), "another stage has this name", name)
+        if name in taken:
+            problems.add(("stage", k, "name"), "another stage has this name", name)
         known = ["name", *ANALYSES, *STAGE_TABLES]
         for key in [key for key in row if key not in known]:
             problems.add(("stage", k, key), f"unknown key of a stage{nearest(key, known)}")
@@ -602,7 +600,8 @@ def stages_of(data: Mapping[str, Any], problems: Problems) -> list[StageTables]:
         owner.pop("output", None)
         chosen = [key for key in ANALYSES if key in row]
         text = f"expected one of the tables [stage.time], [stage.static]; {'not both' if chosen else 'it has none'}"
-        if problems.add_if(len(chosen) != 1, ("stage", k), text):
+        if len(chosen) != 1:
+            problems.add(("stage", k), text)
             continue
         here = {**common, chosen[0]: row[chosen[0]]}
         if k == last and "modes" in data:
@@ -615,7 +614,8 @@ def stages_of(data: Mapping[str, Any], problems: Problems) -> list[StageTables]:
 def _sections(given: Any, common: Any, k: int, problems: Problems) -> Any:
     """The sections of a stage: those of the case, with the prestress that it gives."""
     tables = isinstance(given, Mapping) and isinstance(common, Mapping)
-    if problems.add_if(not tables, ("stage", k, "section"), "expected tables by the names of sections", given):
+    if not tables:
+        problems.add(("stage", k, "section"), "expected tables by the names of sections", given)
         return common
     merged = dict(common)
     for name, table in given.items():
@@ -647,17 +647,20 @@ def load_case_stages(
     ``start`` is the validated last stage, or the case without stages."""
     made: list[StageTables] = []
     text = "modes are those of one state, and not of load cases: give a case without them"
-    if problems.add_if(model.modes is not None, ("modes",), text):
+    if model.modes is not None:
+        problems.add(("modes",), text)
         return []
     if not stages:
         text = "[[load_case]] needs [static], by which each of them is solved, or static stages before"
-        if problems.add_if(model.static is None, (), text):
+        if model.static is None:
+            problems.add((), text)
             return []
         common = {key: value for key, value in data.items() if key not in ("load_case", "combination", "modes")}
         made.append(StageTables(load_cases.PERMANENT, common, (), (), {}, of=()))
     last = [*stages, *made][-1]
     text = f"load cases start from a static state, and the last stage {last.name!r} is none"
-    if problems.add_if("static" not in last.data, (), text):
+    if "static" not in last.data:
+        problems.add((), text)
         return []
     static = last.data["static"] if isinstance(last.data["static"], Mapping) else {}
     method = static.get("method", "newton")
@@ -665,7 +668,8 @@ def load_case_stages(
         static, method = {"method": "newton"}, "newton"
     known = ", ".join(load_cases.METHODS)
     text = f"load cases are solved by the method of the state before them, one of {known}; got {method}"
-    if problems.add_if(method not in load_cases.METHODS, (), text):
+    if method not in load_cases.METHODS:
+        problems.add((), text)
         return []
     names = [stage.name for stage in (*stages, *made)]
     keys = [("load_case", k) for k in range(len(model.load_case))]
@@ -685,7 +689,8 @@ def load_case_stages(
         before = not stages and name == load_cases.PERMANENT
         text = "the state before the load cases has this name: give another"
         text = text if before else "another load case, combination or stage has it"
-        problems.add_if(name in names, (*of, "name"), text, name)
+        if name in names:
+            problems.add((*of, "name"), text, name)
         names.append(name)
         made.append(StageTables(name, {**common, **row}, tuple(row), (), {}, of=of, starts_from=base))
     return made

@@ -13,8 +13,6 @@ from typing import NamedTuple
 import numpy as np
 from scipy.optimize import brentq
 
-from ..errors import refuse_if
-
 Point = tuple[float, float]
 Outline = list[list[Point]]
 """Closed polygons: the outline in one sense, holes in the other."""
@@ -130,7 +128,8 @@ def _without_shape(
 ) -> CrossSection:
     for size in [size for size in sizes if size != "diameter"][:1]:
         raise ValueError(f"{size} needs a shape: {', '.join(SHAPES)}")
-    refuse_if(area is None, "expected area, area_field, or a shape with its sizes", ValueError)
+    if area is None:
+        raise ValueError("expected area, area_field, or a shape with its sizes")
     radius, moment, modulus = np.sqrt(area / np.pi), 0.0 * area, 0.0 * area
     if second_moment is not None:
         moment = second_moment + moment
@@ -155,27 +154,22 @@ def _circle(shape: str, sizes: Mapping[str, float], area: np.ndarray | float | N
         inner = 0.0 * outer
     elif diameter is None:
         solid = float(np.sqrt(np.min(area) / np.pi))
-        refuse_if(
-            thickness > solid,
-            f"thickness = {thickness!r} m is too much for a tube of area = {float(np.min(area))!r} m2: a solid bar "
-            f"of this area has a radius of {solid:.6g} m",
-            ValueError,
-        )
+        if thickness > solid:
+            raise ValueError(
+                f"thickness = {thickness!r} m is too much for a tube of area = {float(np.min(area))!r} m2: a solid bar "
+                f"of this area has a radius of {solid:.6g} m"
+            )
         outer = area / (2.0 * np.pi * thickness) + 0.5 * thickness
         inner = np.maximum(outer - thickness, 0.0)
     elif thickness is None:
         outer, solid = 0.5 * diameter, 0.25 * np.pi * diameter**2
-        refuse_if(
-            np.max(area) > solid,
-            f"diameter = {diameter!r} m is too little: a solid bar of it has {solid:.6g} m2",
-            ValueError,
-        )
+        if np.max(area) > solid:
+            raise ValueError(f"diameter = {diameter!r} m is too little: a solid bar of it has {solid:.6g} m2")
         inner = np.sqrt(np.maximum(outer**2 - area / np.pi, 0.0))
     else:
         outer = 0.5 * diameter
-        refuse_if(
-            thickness > outer, f"thickness = {thickness!r} m is more than half of diameter = {diameter!r} m", ValueError
-        )
+        if thickness > outer:
+            raise ValueError(f"thickness = {thickness!r} m is more than half of diameter = {diameter!r} m")
         inner = outer - thickness
     area = np.pi * (outer**2 - inner**2) if area is None else area
     outer = outer + 0.0 * area
@@ -185,20 +179,15 @@ def _circle(shape: str, sizes: Mapping[str, float], area: np.ndarray | float | N
 
 def _polygon(shape: str, sizes: Mapping[str, float], area: np.ndarray | float | None) -> CrossSection:
     width, web = sizes.get("width"), sizes.get("web_thickness")
-    refuse_if(
-        width is None or (area is None) == ("thickness" not in sizes),
-        f'shape = "{shape}" needs width and thickness, or width and area',
-        ValueError,
-    )
-    refuse_if(
-        np.ndim(area),
-        f'shape = "{shape}" has one area for all bars of a section; area_field goes with circles',
-        ValueError,
-    )
+    if width is None or (area is None) == ("thickness" not in sizes):
+        raise ValueError(f'shape = "{shape}" needs width and thickness, or width and area')
+    if np.ndim(area):
+        raise ValueError(f'shape = "{shape}" has one area for all bars of a section; area_field goes with circles')
     height = sizes.get("height", width)
     outline, _, inner = POLYGONS[shape]
     flanges, webs = inner(width, height)
-    refuse_if(web is not None and web > webs, f"web_thickness = {web!r} m is too much: at most {webs:g} m", ValueError)
+    if web is not None and web > webs:
+        raise ValueError(f"web_thickness = {web!r} m is too much: at most {webs:g} m")
 
     def made(thickness: float) -> Outline:
         return outline(width, height, thickness, thickness if web is None else web)
@@ -208,20 +197,16 @@ def _polygon(shape: str, sizes: Mapping[str, float], area: np.ndarray | float | 
 
     if area is None:
         thickness = sizes["thickness"]
-        refuse_if(
-            thickness > min(flanges, webs if web is None else math.inf),
-            f"thickness = {thickness!r} m is too much: at most {min(flanges, webs):g} m",
-            ValueError,
-        )
+        if thickness > min(flanges, webs if web is None else math.inf):
+            raise ValueError(f"thickness = {thickness!r} m is too much: at most {min(flanges, webs):g} m")
     else:
         most = min(flanges, webs if web is None else math.inf)
         least = 1e-12 * most
-        refuse_if(
-            not area_of(least) < area < area_of(most),
-            f'area = {area!r} m2 cannot be that of shape = "{shape}" with these sizes: a thickness up to '
-            f"{most:g} m gives {area_of(least):.6g} to {area_of(most):.6g} m2",
-            ValueError,
-        )
+        if not area_of(least) < area < area_of(most):
+            raise ValueError(
+                f'area = {area!r} m2 cannot be that of shape = "{shape}" with these sizes: a thickness up to '
+                f"{most:g} m gives {area_of(least):.6g} to {area_of(most):.6g} m2"
+            )
         thickness = brentq(lambda value: area_of(value) - area, least, most, xtol=1e-15 * most, rtol=1e-14)
     found, moment, modulus = weak_axis(made(thickness))
     return CrossSection(found, moment, modulus, math.sqrt(found / math.pi), max(width, height))

@@ -18,7 +18,7 @@ from pydantic import (
     model_validator,
 )
 
-from ..errors import InputError, refuse_if
+from ..errors import InputError
 from .base import (
     Digest,
     FileName,
@@ -127,8 +127,8 @@ class FieldValue(StrictModel):
 def _of_bars(given: Any, info: ValidationInfo) -> str | FieldValue:
     if isinstance(given, str | FieldValue):
         return given
-    text = 'expected the name of a bar group, or a value of a field: { field = "NAME", value = 2 }'
-    refuse_if(not isinstance(given, Mapping), text, ValueError)
+    if not isinstance(given, Mapping):
+        raise ValueError('expected the name of a bar group, or a value of a field: { field = "NAME", value = 2 }')
     return FieldValue.model_validate(dict(given), context=info.context)
 
 
@@ -179,9 +179,9 @@ class NodeSet(StrictModel):
     @field_validator("box")
     @classmethod
     def _ordered(cls, box: tuple[Vector3, Vector3] | None) -> tuple[Vector3, Vector3] | None:
-        for axis, low, high in zip("xyz", *(box or ())):
-            text = f"the first corner must be the lower one, but {axis} is {low!r} and then {high!r}"
-            refuse_if(low > high, text, ValueError)
+        for axis, low, high in zip("xyz", *box, strict=True) if box is not None else ():
+            if low > high:
+                raise ValueError(f"the first corner must be the lower one, but {axis} is {low!r} and then {high!r}")
         return box
 
     @property
@@ -291,18 +291,16 @@ class Section(StrictModel):
         if not isinstance(data, Mapping) or info.context is None or not {"catalogue", "profile"} & set(data):
             return data
         for key in ("catalogue", "profile"):
-            refuse_if(
-                not isinstance(data.get(key), str) or not data[key],
-                "catalogue (a CSV file) and profile (a name in it) need each other",
-                ValueError,
-            )
+            if not isinstance(data.get(key), str) or not data[key]:
+                raise ValueError("catalogue (a CSV file) and profile (a name in it) need each other")
         try:
             values = profile_of(Path(info.context.folder, data["catalogue"]), data["profile"], list(cls.model_fields))
         except InputError as error:
             raise refusal((("catalogue",), str(error), data["catalogue"])) from error
-        text = f"the profile {data['profile']!r} has this value too: remove it here, or from the catalogue"
-        for key in [key for key in values if key in data][:1]:
-            raise refusal(((key,), text, data[key]))
+        taken = [key for key in values if key in data]
+        if taken:
+            text = f"the profile {data['profile']!r} has this value too: remove it here, or from the catalogue"
+            raise refusal(((taken[0],), text, data[taken[0]]))
         return {key: value for key, value in data.items() if key not in ("catalogue", "profile")} | values
 
     @property
@@ -333,11 +331,8 @@ class Section(StrictModel):
             found = self.cross_section(np.array([trial]))
         except OverflowError:
             found = CrossSection(0.0, 0.0, 0.0, 0.0, 0.0)
-        refuse_if(
-            not np.all(np.isfinite(np.hstack(found))) or not np.all(np.asarray(found.area) > 0.0),
-            f"sizes are out of range, in square metres: {self.sizes}",
-            ValueError,
-        )
+        if not np.all(np.isfinite(np.hstack(found))) or not np.all(np.asarray(found.area) > 0.0):
+            raise ValueError(f"sizes are out of range, in square metres: {self.sizes}")
         return self
 
 
@@ -423,7 +418,8 @@ class Support(WithFiles):
     def _moves_what_it_fixes(self) -> Support:
         for axis, moves in zip("xyz", self._vectors.any(axis=0)) if self.fix and self.frame is None else ():
             free = moves and axis not in self.fix
-            refuse_if(free, f'{axis} is given a motion, but fix = "{self.fix}" leaves it free', ValueError)
+            if free:
+                raise ValueError(f'{axis} is given a motion, but fix = "{self.fix}" leaves it free')
         return self
 
     @property
@@ -499,11 +495,14 @@ class Spring(_GroundOrNodes):
     def _as_many_as_directions(cls, value: Any, info: ValidationInfo) -> Any:
         if info.data.get("between") is not None:
             along = "expected one number > 0 [N/m] between nodes, along the line from one to the other"
-            refuse_if(not (is_finite_number(value) and value > 0.0), along, ValueError)
+            if not (is_finite_number(value) and value > 0.0):
+                raise ValueError(along)
             return float(value)
         three = isinstance(value, list | tuple) and len(value) == 3 and all(map(is_finite_number, value))
-        refuse_if(not three, "expected three numbers [kx, ky, kz] [N/m] to the ground", ValueError)
-        refuse_if(min(value) < 0.0, "expected values >= 0", ValueError)
+        if not three:
+            raise ValueError("expected three numbers [kx, ky, kz] [N/m] to the ground")
+        if min(value) < 0.0:
+            raise ValueError("expected values >= 0")
         return tuple(map(float, value))
 
 
@@ -516,7 +515,8 @@ class Dashpot(_GroundOrNodes):
     @field_validator("coefficient")
     @classmethod
     def _acts(cls, value: float, info: ValidationInfo) -> float:
-        refuse_if(info.data.get("between") is not None and not value, "expected a number > 0 between nodes", ValueError)
+        if info.data.get("between") is not None and not value:
+            raise ValueError("expected a number > 0 between nodes")
         return value
 
 
@@ -572,9 +572,8 @@ class LoadFile(StrictModel):
     @classmethod
     def _alone(cls, data: Any) -> Any:
         taken = [key for key in ("node_set", "force", "table", "table_file") if key in data]
-        refuse_if(
-            taken, f"file gives the forces of nodes or node sets over time, without {', '.join(taken)}", ValueError
-        )
+        if taken:
+            raise ValueError(f"file gives the forces of nodes or node sets over time, without {', '.join(taken)}")
         return data
 
     @model_validator(mode="after")
@@ -730,9 +729,11 @@ class TimeKeys(StrictModel):
             return "auto"
         number = isinstance(step, int | float) and not isinstance(step, bool)
         text = 'expected a number of seconds in SI units without quotes and unit, or "auto"'
-        refuse_if(not number, text, ValueError)
+        if not number:
+            raise ValueError(text)
         positive = step > 0 and is_finite_number(step)
-        refuse_if(not positive, 'expected a finite number of seconds > 0, or "auto"', ValueError)
+        if not positive:
+            raise ValueError('expected a finite number of seconds > 0, or "auto"')
         return _computable.func(float(step))
 
 

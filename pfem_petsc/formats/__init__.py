@@ -133,17 +133,16 @@ def read_triangles(path: Path) -> tuple[np.ndarray, np.ndarray]:
     """
     import numpy as np
 
-    from ..errors import InputError, refuse_if
+    from ..errors import InputError
     from ._common import whole_numbers
 
     try:
         points, corners, offsets = _reader_of(path, "", "read_faces").read_faces(path)
         sizes = np.diff(offsets)
-        refuse_if(
-            not sizes.size or not np.isfinite(points).all(),
-            f"has {'coordinates that are not finite' if sizes.size else 'no faces'}",
-        )
-        refuse_if(sizes.min() < 3, f"face {sizes.argmin()} (from 0) has {sizes.min()} corners: expected 3 or more")
+        if not sizes.size or not np.isfinite(points).all():
+            raise InputError(f"has {'coordinates that are not finite' if sizes.size else 'no faces'}")
+        if sizes.min() < 3:
+            raise InputError(f"face {sizes.argmin()} (from 0) has {sizes.min()} corners: expected 3 or more")
         n = len(points)
         corners = whole_numbers(corners, 0, n, "there is no point ", f": the file has {n}, from 0")
     except InputError as error:
@@ -222,13 +221,11 @@ def writer_of(path: Path) -> Any:
     InputError
         If there is none for its suffix.
     """
-    from ..errors import refuse_if
+    from ..errors import InputError
 
     known = suffixes("write")
-    refuse_if(
-        path.suffix.lower() not in known,
-        f"{path}: no writer for {path.suffix or 'no suffix'}; known suffixes: {', '.join(known)}",
-    )
+    if path.suffix.lower() not in known:
+        raise InputError(f"{path}: no writer for {path.suffix or 'no suffix'}; known suffixes: {', '.join(known)}")
     return known[path.suffix.lower()]
 
 

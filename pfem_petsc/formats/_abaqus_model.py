@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..errors import InputError, refuse_if
+from ..errors import InputError
 from ..files import readable_whole
 from ..mesh.whole import WholeMesh
 from ._common import number_of, numbers_of, places_of, shown, whole_numbers
@@ -103,7 +103,8 @@ class Block:
     def required(self, name: str) -> str:
         """Return the value of a parameter that must be there."""
         value = self.parameters.get(name)
-        refuse_if(not value, f"{self.where}: the parameter {name}= is missing")
+        if not value:
+            raise InputError(f"{self.where}: the parameter {name}= is missing")
         return value
 
     def lines(self, *pieces: Piece) -> Iterator[tuple[str, list[str]]]:
@@ -181,7 +182,8 @@ def blocks(path: Path, above: tuple[Path, ...] = (), before: Block | None = None
         content = readable_whole(path).read_bytes().removeprefix(codecs.BOM_UTF8)
     except OSError as error:
         raise InputError(f"{path}: cannot open: {error.strerror}") from None
-    refuse_if(b"\0" in content, f"{path}: is not text: save it as an Abaqus input file in UTF-8 or ASCII")
+    if b"\0" in content:
+        raise InputError(f"{path}: is not text: save it as an Abaqus input file in UTF-8 or ASCII")
     content = content.replace(b"\r\n", b"\n").replace(b"\r", b"\n")
     line, block = 1, before
     for k, text in enumerate(_KEYWORD.split(_COMMENT.sub(b"", content))):
@@ -204,7 +206,8 @@ def blocks(path: Path, above: tuple[Path, ...] = (), before: Block | None = None
 
 def _keyword(path: Path, line: int, text: str) -> Block:
     words = words_of(text.lstrip("* \t"))
-    refuse_if(not words[0], f"{path}: line {line}: {text.strip()[:60]!r} is no keyword")
+    if not words[0]:
+        raise InputError(f"{path}: line {line}: {text.strip()[:60]!r} is no keyword")
     keyword, *pairs = [(" ".join(name.upper().split()), value) for name, _, value in (w.partition("=") for w in words)]
     name = _SPACED.get(keyword[0].replace(" ", ""), keyword[0])
     return Block(path, line, name, {name: value.strip().strip('"') for name, value in pairs if name})
@@ -213,11 +216,10 @@ def _keyword(path: Path, line: int, text: str) -> Block:
 def _included(block: Block, path: Path, above: tuple[Path, ...]) -> Path:
     name = block.required("INPUT")
     file = (above[0] if above else path).parent / name
-    refuse_if(
-        len(above) >= _DEEPEST or file.resolve() in {other.resolve() for other in (*above, path)},
-        f"{block.where}: {name} includes itself",
-    )
-    refuse_if(not file.is_file(), f"{block.where}: there is no file {file}")
+    if len(above) >= _DEEPEST or file.resolve() in {other.resolve() for other in (*above, path)}:
+        raise InputError(f"{block.where}: {name} includes itself")
+    if not file.is_file():
+        raise InputError(f"{block.where}: there is no file {file}")
     return file
 
 
@@ -418,7 +420,8 @@ def _placing(block: Block) -> np.ndarray:
     if len(rows) < 2:
         return np.vstack([np.eye(3), move])
     start, axis = rows[1, :3], rows[1, 3:6] - rows[1, :3]
-    refuse_if(not axis.any(), f"{block.where}: the axis of the rotation has no length")
+    if not axis.any():
+        raise InputError(f"{block.where}: the axis of the rotation has no length")
     turn = Rotation.from_rotvec(np.radians(rows[1, 6]) * axis / np.linalg.norm(axis)).as_matrix()
     return np.vstack([turn.T, (move - start) @ turn.T + start])
 
@@ -521,18 +524,15 @@ class Deck:
         match block.keyword:
             case "PART":
                 self._scope = _Scope(block.required("NAME"))
-                refuse_if(
-                    self.parts.setdefault(name.upper(), self._scope) is not self._scope,
-                    f"{block.where}: there are two parts of the name {name}",
-                )
+                if self.parts.setdefault(name.upper(), self._scope) is not self._scope:
+                    raise InputError(f"{block.where}: there are two parts of the name {name}")
             case "INSTANCE":
                 part = self.parts.get(block.required("PART").upper())
-                refuse_if(part is None, f"{block.where}: there is no part {block.get('PART')}")
+                if part is None:
+                    raise InputError(f"{block.where}: there is no part {block.get('PART')}")
                 self._outer, self._scope = scope, part.instance(block.required("NAME"), _placing(block))
-                refuse_if(
-                    self.scopes.setdefault(name.upper(), self._scope) is not self._scope,
-                    f"{block.where}: there are two instances of the name {name}",
-                )
+                if self.scopes.setdefault(name.upper(), self._scope) is not self._scope:
+                    raise InputError(f"{block.where}: there are two instances of the name {name}")
             case "ASSEMBLY":
                 self._scope = self.assembly
             case "END INSTANCE":
@@ -542,9 +542,8 @@ class Deck:
 
     def _add_nodes(self, block: Block) -> None:
         system = block.get("SYSTEM", "R").upper()
-        refuse_if(
-            system != "R", f"{block.where}: SYSTEM={system} is not read: write the nodes in Cartesian coordinates"
-        )
+        if system != "R":
+            raise InputError(f"{block.where}: SYSTEM={system} is not read: write the nodes in Cartesian coordinates")
         rows = block.rows(7)[:, :4]
         labels = _labels(rows[:, 0], block, "node")
         self._scope.nodes.append((labels, np.nan_to_num(rows[:, 1:], posinf=np.inf, neginf=-np.inf)))
@@ -586,7 +585,8 @@ class Deck:
     def _entries(self, kind: str, block: Block) -> Iterator[_Labels]:
         """Yield the members that ``*NSET`` or ``*ELSET`` names."""
         instance = block.get("INSTANCE").upper()
-        refuse_if(instance and instance not in self.scopes, f"{block.where}: there is no instance {instance}")
+        if instance and instance not in self.scopes:
+            raise InputError(f"{block.where}: there is no instance {instance}")
         if kind == "NSET" and block.get("ELSET"):
             named = self._named("ELSET", block, block.get("ELSET"), self._scope, instance)
             for entry in named or [_Labels(_NOTHING)]:
@@ -599,7 +599,8 @@ class Deck:
         elif "GENERATE" in block.parameters:
             rows = block.rows(3, 2)
             for row in _labels(np.where(np.isnan(rows), 1.0, rows).ravel(), block, "member").reshape(-1, 3):
-                refuse_if(row[1] < row[0], f"{block.where}: {row[0]}, {row[1]}, {row[2]} are not first, last and step")
+                if row[1] < row[0]:
+                    raise InputError(f"{block.where}: {row[0]}, {row[1]}, {row[2]} are not first, last and step")
                 yield _Labels(row, True, instance)
         elif (numbers := block.numbers()) is not None:
             yield _Labels(_labels(numbers, block, "member"), instance=instance)
@@ -616,7 +617,8 @@ class Deck:
         if name.isdecimal():
             return [_Labels(_labels(np.array([float(name)]), block, "member"), instance=instance)]
         found = (self.scopes[instance] if instance else scope).sets[kind].get(name.upper())
-        refuse_if(found is None, f"{block.where}: {name!r} is neither a number nor an existing {_WHAT[kind]} set")
+        if found is None:
+            raise InputError(f"{block.where}: {name!r} is neither a number nor an existing {_WHAT[kind]} set")
         return [entry._replace(instance=entry.instance or instance) for entry in found.entries]
 
     def mesh(self) -> WholeMesh:
@@ -728,7 +730,8 @@ class Deck:
                 yield block, found
 
     def _set(self, block: Block, scope: _Scope, name: str) -> _Set:
-        refuse_if(name.upper() not in scope.sets["ELSET"], f"{block.where}: there is no element set {name}")
+        if name.upper() not in scope.sets["ELSET"]:
+            raise InputError(f"{block.where}: there is no element set {name}")
         return scope.sets["ELSET"][name.upper()]
 
     def section_members(self) -> Iterator[tuple[Block, str, np.ndarray]]:

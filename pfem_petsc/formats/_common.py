@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..errors import InputError, refuse_if
+from ..errors import InputError
 
 if TYPE_CHECKING:
     from ..mesh.whole import WholeMesh
@@ -62,7 +62,8 @@ class NumberStream:
         """
         row = np.dtype([(f"{k}", self._order + kind if self._order else "f8") for k, kind in enumerate(kinds)])
         start, self._at = self._at, self._at + n * row.itemsize
-        refuse_if(not start <= self._at <= len(self._all), "it ends early", EOFError)
+        if not start <= self._at <= len(self._all):
+            raise EOFError("it ends early")
         return np.ndarray((n,), row, self._all, start)
 
 

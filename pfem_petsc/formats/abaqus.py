@@ -20,7 +20,7 @@ from typing import Any
 
 import numpy as np
 
-from ..errors import refuse_if
+from ..errors import InputError
 from ..mesh.whole import PLANE, WholeMesh
 from ._abaqus_model import AtNodes, Block, Deck, blocks, listed
 from ._common import alike, free_name, name_of, number_of
@@ -51,7 +51,8 @@ def read(path: Path, fields: Collection[str] | None = None) -> WholeMesh:
         if not deck.add(block):
             break
     mesh = deck.mesh()
-    refuse_if(len(mesh.bars) == 0, f"{path}: has no trusses or beams, which would be bars")
+    if len(mesh.bars) == 0:
+        raise InputError(f"{path}: has no trusses or beams, which would be bars")
     _add_materials(mesh, deck)
     _add_sections(mesh, deck)
     told = [*mesh.warnings]
@@ -107,24 +108,29 @@ def _read_property(block: Block, material: dict[str, Any]) -> None:
             for name, key in (("ALPHA", "alpha"), ("BETA", "stiffness_damping")):
                 value = number_of(block.get(name)) if name in block.parameters else material.get(key, 0.0)
                 material[key] = 0.0 if np.isnan(value) else value
-                refuse_if(np.isnan(value), f"{block.get(name)!r} is not a number: left out", _RemarkError)
+                if np.isnan(value):
+                    raise _RemarkError(f"{block.get(name)!r} is not a number: left out")
         case "NO TENSION":
             raise _RemarkError("left out: there is no law of bars that carry compression alone")
         case "NO COMPRESSION":
             material["cable"] = True
         case keyword:
             kind = block.get("TYPE", "ISOTROPIC")
-            refuse_if(kind.upper() not in ("ISOTROPIC", "ISO"), f"TYPE={kind}: left out", _RemarkError)
+            if kind.upper() not in ("ISOTROPIC", "ISO"):
+                raise _RemarkError(f"TYPE={kind}: left out")
             key, column = _PROPERTIES.get(keyword, ("plastic", 2))
             rows = block.rows(8, 1)
-            refuse_if(len(rows) == 0 or not np.isfinite(rows[0, 0]), "no values: left out", _RemarkError)
+            if len(rows) == 0 or not np.isfinite(rows[0, 0]):
+                raise _RemarkError("no values: left out")
             negative = keyword in ("ELASTIC", "DENSITY") and rows[0, 0] <= 0.0
-            refuse_if(negative, f"{rows[0, 0]:g} is not positive: left out", _RemarkError)
+            if negative:
+                raise _RemarkError(f"{rows[0, 0]:g} is not positive: left out")
             first = rows[:, column]
             cold = np.isnan(first) | (first == first[0]) if key == "plastic" else np.arange(len(rows)) == 0
             material[key] = _hardening(block, rows[cold, :2]) if key == "plastic" else float(rows[0, 0])
             told = f"values at {first[0]:g} degrees are taken for all temperatures"
-            refuse_if(not cold.all(), told, _RemarkError)
+            if not cold.all():
+                raise _RemarkError(told)
 
 
 def _hardening(block: Block, rows: np.ndarray) -> tuple[str, np.ndarray, np.ndarray]:
@@ -133,10 +139,13 @@ def _hardening(block: Block, rows: np.ndarray) -> tuple[str, np.ndarray, np.ndar
     stress, strain = np.nan_to_num(rows).T
     known = kind == "ISOTROPIC" or (kind == "KINEMATIC" and len(stress) <= 2)
     falls = (np.diff(strain) <= 0.0).any() or (np.diff(stress) < 0.0).any()
-    refuse_if(not known, f"HARDENING={kind}: left out", _RemarkError)
-    refuse_if("RATE" in block.parameters, "RATE: left out", _RemarkError)
+    if not known:
+        raise _RemarkError(f"HARDENING={kind}: left out")
+    if "RATE" in block.parameters:
+        raise _RemarkError("RATE: left out")
     told = "a curve that does not start at plastic strain 0, or that falls: left out"
-    refuse_if(strain[0] != 0.0 or stress[0] <= 0.0 or falls, told, _RemarkError)
+    if strain[0] != 0.0 or stress[0] <= 0.0 or falls:
+        raise _RemarkError(told)
     return kind, stress, strain
 
 
@@ -436,9 +445,11 @@ class _Conditions:
 
     def _weigh(self, block: Block, words: list[str]) -> None:
         told = "left out: only GRAV is read of distributed loads"
-        refuse_if(len(words) < 2 or words[1].upper() != "GRAV", told, _RemarkError)
+        if len(words) < 2 or words[1].upper() != "GRAV":
+            raise _RemarkError(told)
         values = np.array([_value(words, at) for at in range(2, 6)])
-        refuse_if(not np.isfinite(values).all(), "left out: expected numbers", _RemarkError)
+        if not np.isfinite(values).all():
+            raise _RemarkError("left out: expected numbers")
         key = tuple((values[0] * values[1:]).tolist()), self._over
         _, times = self._gravity.setdefault(key, (self._line, np.zeros(len(self._mesh.bars), np.int64)))
         times[self._deck.members_of("ELSET", block, words[0]) if words[0] else slice(None)] += 1
@@ -446,7 +457,8 @@ class _Conditions:
     def _push(self, block: Block, words: list[str]) -> None:
         axis, value = _value(words, 1), _value(words, 2)
         along = axis in _AXES and np.isfinite(value)
-        refuse_if(not along, "left out: only forces along x, y and z are read", _RemarkError)
+        if not along:
+            raise _RemarkError("left out: only forces along x, y and z are read")
         name, _ = self._group(block, words[0])
         self._forces.setdefault((name, self._over), np.zeros(3))[int(axis) - 1] += value
 
@@ -456,7 +468,8 @@ class _Conditions:
             first, last, value = (_value(words, at) for at in (1, 2, 3))
             last = last or first
             known = 1.0 <= first <= last <= 6.0 and np.isfinite(value)
-            refuse_if(not known, "left out: expected degrees of freedom from 1 to 6, and a number", _RemarkError)
+            if not known:
+                raise _RemarkError("left out: expected degrees of freedom from 1 to 6, and a number")
             axes = "xyz"[int(first) - 1 : int(last)]  # bars have no rotations
         name, members = self._group(block, words[0])
         motion, told = self._motion(block, value) if axes and value else (_AT_REST, "")
@@ -464,7 +477,8 @@ class _Conditions:
         for axis in map("xyz".index, axes):
             self._supports[name, axis, motion] = members
             self._held[members, axis] = number
-        refuse_if(told, told, _RemarkError)
+        if told:
+            raise _RemarkError(told)
 
     def _motion(self, block: Block, value: float) -> tuple[tuple[str, _Rows], str]:
         """Return a motion, as the key of a support and its rows, and what is to be said about one that is not there."""
@@ -487,15 +501,18 @@ class _Conditions:
 
     def _heat(self, block: Block, words: list[str]) -> None:
         value, told = _value(words, 1), "left out: expected nodes and a temperature"
-        refuse_if(not np.isfinite(value) or len(words) < 2, told, _RemarkError)
+        if not np.isfinite(value) or len(words) < 2:
+            raise _RemarkError(told)
         told = "left out: temperatures act in *STATIC and *DYNAMIC steps"
-        refuse_if(not (self._static or self._dynamic), told, _RemarkError)
+        if not (self._static or self._dynamic):
+            raise _RemarkError(told)
         self._temperatures.append((self._deck.members_of("NSET", block, words[0]), value, self._over))
 
     def _group(self, block: Block, target: str) -> tuple[str, np.ndarray]:
         """Return the name of the node group with the nodes of a set, or of the node of a label, and its members."""
         members, groups = self._deck.members_of("NSET", block, target), self._mesh.node_groups
-        refuse_if(len(members) == 0, "left out: it names no node where a bar ends", _RemarkError)
+        if len(members) == 0:
+            raise _RemarkError("left out: it names no node where a bar ends")
         wanted = target.replace('"', "").replace("/", "_")
         last = wanted.rpartition(".")[2]
         new = f"node_{wanted}" if last.isdecimal() else wanted
@@ -635,17 +652,22 @@ class _Conditions:
         free = not directed and len(lines) > 1 and lines[0][0] in ("1", "2", "3", "0")
         data = lines[int(directed or free) :]
         value = _value(data[0], 0) if data else np.nan
-        refuse_if(odd, f"{', '.join(odd[:1])} is not read", _RemarkError)
-        refuse_if(not 0.0 < value < np.inf, "expected a positive number", _RemarkError)
-        refuse_if(min(nodes) < 0, "no bar ends at their nodes", _RemarkError)
+        if odd:
+            raise _RemarkError(f"{', '.join(odd[:1])} is not read")
+        if not 0.0 < value < np.inf:
+            raise _RemarkError("expected a positive number")
+        if min(nodes) < 0:
+            raise _RemarkError("no bar ends at their nodes")
         beyond = any(axis not in _AXES for axis in axes)
-        refuse_if(beyond, "bars have the degrees of freedom 1, 2 and 3 alone", _RemarkError)
+        if beyond:
+            raise _RemarkError("bars have the degrees of freedom 1, 2 and 3 alone")
         if len(nodes) == 1:
             values[block.keyword][nodes[0], int(axes[0]) - 1 if axes else 0] += value
             return
         line = self._mesh.points[nodes[1]] - self._mesh.points[nodes[0]]
         along = not axes or (axes[0] == axes[1] and np.count_nonzero(line) == 1 and line[int(axes[0]) - 1])
-        refuse_if(not along, "those of a case act along the line between their nodes", _RemarkError)
+        if not along:
+            raise _RemarkError("those of a case act along the line between their nodes")
         labels = [f"node_{instance}.{label}" if instance else f"node_{label}" for instance, label in element.nodes]
         groups, own = self._mesh.node_groups, tables[block.keyword.lower()]
         names = [name_of(groups, np.array([node]), label) for node, label in zip(nodes, labels)]

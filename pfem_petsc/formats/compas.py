@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from ..errors import InputError, refuse_if
+from ..errors import InputError
 from ..mesh.whole import WholeMesh
 from ._common import edges
 
@@ -38,7 +38,8 @@ def read(path: Path, fields: Collection[str] | None = None) -> WholeMesh:
         found = list(_structures(content))
     except (ValueError, RecursionError) as error:
         raise InputError(f"{path}: is not JSON: {error}") from None
-    refuse_if(not found, f"{path}: has no network, graph or mesh of COMPAS (nodes and edges, or vertices and faces)")
+    if not found:
+        raise InputError(f"{path}: has no network, graph or mesh of COMPAS (nodes and edges, or vertices and faces)")
     data, kind = found[0]
     number = {key: i for i, key in enumerate(data[kind])}
     try:

@@ -18,7 +18,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ..errors import InputError, refuse_if
+from ..errors import InputError
 from ..mesh.whole import WholeMesh
 
 SUFFIXES = (".csv",)
@@ -191,11 +191,11 @@ def _numbers_of_ids(nodes: _Table, bars: _Table, pair: tuple[int, int]) -> tuple
     if not candidates:
         rows = list(map(str, range(nodes.n)))
         for name, place in nodes.others(map(nodes.place, (*_AXES, _GROUPS))):
-            refuse_if(
-                serves(place) and list(nodes.labels(place)) != rows,
-                f"{nodes.path}: line 1: column {name!r} may have the ids of nodes: call it 'node', or add a column "
-                f"'node' with the numbers from 0 if it does not (understood are {_KNOWN_IDS})",
-            )
+            if serves(place) and list(nodes.labels(place)) != rows:
+                raise InputError(
+                    f"{nodes.path}: line 1: column {name!r} may have the ids of nodes: call it 'node', or add a column "
+                    f"'node' with the numbers from 0 if it does not (understood are {_KNOWN_IDS})"
+                )
         return None, {label: i for i, label in enumerate(rows)}
     number: dict[str, int] = {}
     for i, label in enumerate(nodes.labels(candidates[0])):
@@ -218,7 +218,8 @@ class _Table:
         except (OSError, UnicodeDecodeError) as error:
             raise InputError(f"{path}: cannot be read: {error}; save it as text in UTF-8") from None
         kept = [i for i, line in enumerate(lines) if line.strip(" ,;\t") and not line.lstrip().startswith("#")]
-        refuse_if(not kept, f"{path}: is empty: the first line has the names of the columns")
+        if not kept:
+            raise InputError(f"{path}: is empty: the first line has the names of the columns")
         separator = max(";\t,", key=lines[kept[0]].count)
         above = kept[0] - 1
         # programs that write arrays put a # before the names of the columns
@@ -239,7 +240,8 @@ class _Table:
         for k, row in enumerate(rows):
             if len(row) != width and (len(row) < width or any(word.strip() for word in row[width:])):
                 raise InputError(f"{self.where(k)}: {len(row)} entries; expected {width}, as the first line has")
-        refuse_if(len(rows) != self.n and not head_only, f"{path}: a text in quotes goes over several lines")
+        if len(rows) != self.n and not head_only:
+            raise InputError(f"{path}: a text in quotes goes over several lines")
         self.headings = [_without_unit(name) for name in self._given]
         self.columns = [list(column) for column in zip(*rows)] or [[] for _ in self._given]
         self._keys = [re.sub(r"[\W_]+", "", name.lower()) for name in self.headings]

@@ -16,7 +16,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..errors import InputError, refuse_if
+from ..errors import InputError
 from ..mesh.whole import WholeMesh
 from ._common import NumberStream, numbers_of, places_of, shown, whole_numbers
 
@@ -45,9 +45,8 @@ def read(path: Path, fields: Collection[str] | None = None) -> WholeMesh:
     content = path.read_bytes().removeprefix(codecs.BOM_UTF8)  # which editors on Windows insert
     sections = _sections(path, content)
     layout = _layout(path, b"".join(sections.get("MeshFormat", [])))
-    refuse_if(
-        "PartitionedEntities" in sections, f"{path}: section $PartitionedEntities: save the mesh without partitions"
-    )
+    if "PartitionedEntities" in sections:
+        raise InputError(f"{path}: section $PartitionedEntities: save the mesh without partitions")
     for name in [name for name in ("Nodes", "Elements") if name not in sections]:
         raise InputError(f"{path}: has no section ${name}")
 
@@ -65,11 +64,11 @@ def read(path: Path, fields: Collection[str] | None = None) -> WholeMesh:
     lines, marked = elements.joined_lines() if layout.old else elements.lines, elements.marked
     if any(_ORDERED in comments for comments in sections.get("Comments", [])):
         lines = lines[np.argsort(lines[:, 0], kind="stable")]
-        refuse_if(
-            (np.diff(lines[:, 0]) != 1).any(),
-            f"{path}: section $Elements: the tags of the lines do not follow one another, as $Comments says: "
-            "remove that section",
-        )
+        if (np.diff(lines[:, 0]) != 1).any():
+            raise InputError(
+                f"{path}: section $Elements: the tags of the lines do not follow one another, as $Comments says: "
+                "remove that section"
+            )
     used = np.concatenate([lines[:, 1:3].ravel(), marked[:, 0]])
     place, there = places_of(known, used)
     if not there.all():
@@ -108,38 +107,34 @@ def _layout(path: Path, payload: bytes) -> _Layout:
     first, _, rest = payload.partition(b"\n")
     words = first.split()
     where = f"{path}: section $MeshFormat"
-    refuse_if(
-        len(words) != 3 or words[1] not in (b"0", b"1") or words[2] not in (b"4", b"8"),
-        f"{where}: {shown(first)!r} is not 'version file-type data-size', such as '4.1 0 8'",
-    )
-    refuse_if(
-        words[0] not in (b"2", b"2.0", b"2.1", b"2.2", b"4.1"),
-        f"{where}: version {shown(words[0])} is not read; save the mesh as version 4.1 or 2.2 "
-        "(in Gmsh: Mesh.MshFileVersion)",
-    )
+    if len(words) != 3 or words[1] not in (b"0", b"1") or words[2] not in (b"4", b"8"):
+        raise InputError(f"{where}: {shown(first)!r} is not 'version file-type data-size', such as '4.1 0 8'")
+    if words[0] not in (b"2", b"2.0", b"2.1", b"2.2", b"4.1"):
+        raise InputError(
+            f"{where}: version {shown(words[0])} is not read; save the mesh as version 4.1 or 2.2 "
+            "(in Gmsh: Mesh.MshFileVersion)"
+        )
     binary = words[1] == b"1"
-    refuse_if(
-        binary and rest[:4] not in (b"\x01\0\0\0", b"\0\0\0\x01"),
-        f"{where}: the binary number 1 that shows the byte order is missing",
-    )
+    if binary and rest[:4] not in (b"\x01\0\0\0", b"\0\0\0\x01"):
+        raise InputError(f"{where}: the binary number 1 that shows the byte order is missing")
     # versions 2 to 2.2 differ in nothing that is read here
     return _Layout(words[0] != b"4.1", binary, ">" if rest[:1] == b"\0" else "<", "u" + words[2].decode())
 
 
 def _sections(path: Path, content: bytes) -> dict[str, list[bytes]]:
     """Return the payloads of the sections of a file by name."""
-    refuse_if(
-        not content[:1000].lstrip().startswith(b"$MeshFormat"),
-        f"{path}: does not start with $MeshFormat: not a Gmsh mesh of version 2.2 or 4.1",
-    )
+    if not content[:1000].lstrip().startswith(b"$MeshFormat"):
+        raise InputError(f"{path}: does not start with $MeshFormat: not a Gmsh mesh of version 2.2 or 4.1")
     found: dict[str, list[bytes]] = {}
     at = 0
     while (at := content.find(b"$", at)) >= 0:
         begin = content.find(b"\n", at) + 1
         name = content[at + 1 : begin].strip()
-        refuse_if(not name.isalnum(), f"{path}: {shown(name)!r} is not the name of a section")
+        if not name.isalnum():
+            raise InputError(f"{path}: {shown(name)!r} is not the name of a section")
         end = content.find(b"$End" + name, begin)
-        refuse_if(end < 0, f"{path}: section ${shown(name)} has no end; the file is truncated")
+        if end < 0:
+            raise InputError(f"{path}: section ${shown(name)} has no end; the file is truncated")
         found.setdefault(name.decode(), []).append(content[begin:end])
         at = end + 4 + len(name)
     return found
@@ -168,7 +163,8 @@ class _Numbers(NumberStream):
         if not self.layout.binary:
             return int(self.sizes(1)[0])
         line, _, self._all = self._all.partition(b"\n")
-        refuse_if(not re.fullmatch(rb"\s*\d{1,18}\s*", line), f"{self.where}: {shown(line)!r} is not a count")
+        if not re.fullmatch(rb"\s*\d{1,18}\s*", line):
+            raise InputError(f"{self.where}: {shown(line)!r} is not a count")
         return int(line)
 
     def ints(self, n: int) -> np.ndarray:
@@ -215,11 +211,13 @@ class _Numbers(NumberStream):
             if done > declared:
                 break
             yield head
-        refuse_if(done != declared, f"{self.where} declares {declared} {what}, its blocks hold {done}")
+        if done != declared:
+            raise InputError(f"{self.where} declares {declared} {what}, its blocks hold {done}")
 
     def end(self) -> None:
         """Refuse surplus numbers."""
-        refuse_if(self.left, f"{self.where}: has more numbers than its counts declare")
+        if self.left:
+            raise InputError(f"{self.where}: has more numbers than its counts declare")
 
     def _whole(self, values: np.ndarray) -> np.ndarray:
         if values.dtype.kind != "f":
@@ -231,11 +229,11 @@ def _physical_names(path: Path, payload: bytes) -> list[dict[int, str]]:
     """Return names of groups of points and lines by tag; this section is text even in binary files."""
     count, *lines = payload.decode("utf-8", "replace").split("\n") if payload.strip() else ["0"]
     found = [re.fullmatch(r'\s*(-?\d{1,18})\s+(-?\d{1,18})\s+"(.+?)"+\s*', line) for line in lines if line.strip()]
-    refuse_if(
-        None in found or count.strip() != str(len(found)),
-        f"{path}: section $PhysicalNames: its {len(found)} lines after the first are not the {count[:20].strip()} "
-        "lines 'dimension tag \"name\"' that it declares",
-    )
+    if None in found or count.strip() != str(len(found)):
+        raise InputError(
+            f"{path}: section $PhysicalNames: its {len(found)} lines after the first are not the {count[:20].strip()} "
+            "lines 'dimension tag \"name\"' that it declares"
+        )
     return [{int(match[2]): match[3] for match in found if int(match[1]) == dimension} for dimension in (0, 1)]
 
 
@@ -262,7 +260,8 @@ def _nodes(numbers: _Numbers) -> tuple[np.ndarray, np.ndarray]:
         return tags, points
     tags, points = [np.empty(0, np.int64)], [np.empty((0, 3))]
     for dimension, _, parametric, n in numbers.blocks("nodes"):
-        refuse_if(dimension not in (0, 1, 2, 3), f"{numbers.where}: a block of entities of dimension {dimension}")
+        if dimension not in (0, 1, 2, 3):
+            raise InputError(f"{numbers.where}: a block of entities of dimension {dimension}")
         tags.append(numbers.sizes(n))
         width = 3 + (dimension if parametric else 0)
         points.append(numbers.reals(n * width).reshape(n, width)[:, :3].astype(np.float64))
@@ -298,8 +297,10 @@ class _Elements:
         return self._combinations.setdefault(combination, len(self._combinations))
 
     def _nodes_of(self, kind: int) -> int:
-        refuse_if(kind in _CURVED, f"{self._numbers.where}: curved lines (type {kind}); make the mesh of order 1")
-        refuse_if(kind not in _NODES, f"{self._numbers.where}: {kind} is not a known type of element")
+        if kind in _CURVED:
+            raise InputError(f"{self._numbers.where}: curved lines (type {kind}); make the mesh of order 1")
+        if kind not in _NODES:
+            raise InputError(f"{self._numbers.where}: {kind} is not a known type of element")
         return _NODES[kind]
 
     def _blocks_4(self) -> Iterator[tuple[int, np.ndarray, int]]:
@@ -322,16 +323,16 @@ class _Elements:
                 known = len(words) == 3 and (abs(words) < 1e9).all()
                 kind, n_tags = words[1:].astype(np.int64).tolist() if known else (0, 0)
             width = first + n_tags + self._nodes_of(kind)
-            refuse_if(not 0 <= n_tags < 1000, f"{numbers.where}: {n_tags} tags of element {done} of {declared}")
+            if not 0 <= n_tags < 1000:
+                raise InputError(f"{numbers.where}: {n_tags} tags of element {done} of {declared}")
             if not binary:
                 ahead = numbers.ahead(min(run, declared - done) * width)
                 ahead = ahead[: len(ahead) // width * width].reshape(-1, width)
                 alike = (ahead[:, 1] == kind) & (ahead[:, 2] == n_tags)
                 n = max(1, len(alike) if alike.all() else int(alike.argmin()))
                 run = 2 * n
-            refuse_if(
-                not 0 < n <= declared - done, f"{numbers.where} declares {declared} elements, its blocks hold others"
-            )
+            if not 0 < n <= declared - done:
+                raise InputError(f"{numbers.where} declares {declared} elements, its blocks hold others")
             done += n
             rows = numbers.ints(n * width).reshape(n, width)
             tags, which = np.unique(rows[:, first] if n_tags else np.zeros(n, np.int64), return_inverse=True)
@@ -373,13 +374,12 @@ def _data(where: str, payload: bytes, layout: _Layout) -> tuple[str, np.ndarray,
     words: list[list[bytes]] = []
     for _ in range(3):  # texts, real numbers, whole numbers
         count = text.readline().strip()
-        refuse_if(not re.fullmatch(rb"\d{1,2}", count), f"{where}: {shown(count)!r} is not the number of its tags")
+        if not re.fullmatch(rb"\d{1,2}", count):
+            raise InputError(f"{where}: {shown(count)!r} is not the number of its tags")
         words.append([text.readline().strip() for _ in range(int(count))])
     name = words[0][0].decode("utf-8", "replace").strip('"') if words[0] else ""
-    refuse_if(
-        len(words[2]) < 3 or not all(re.fullmatch(rb"\d{1,18}", word) for word in words[2][:3]),
-        f"{where} {name!r}: expected three whole numbers: time step, components, number of elements",
-    )
+    if len(words[2]) < 3 or not all(re.fullmatch(rb"\d{1,18}", word) for word in words[2][:3]):
+        raise InputError(f"{where} {name!r}: expected three whole numbers: time step, components, number of elements")
     if int(words[2][1]) != 1 or not name or "/" in name:
         return name, np.empty(0, np.int64), None
     numbers = _Numbers(f"{where} {name!r}", text.read(), layout)

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from mpi4py import MPI
 
-from ..errors import InputError, refuse_if
+from ..errors import InputError
 from ..mesh.exchange import Router
 from ..mesh.slab import MeshSlab, check_memory, index_type, slab_of, slab_range
 from ..mesh.whole import WholeMesh, check_fields, without_slashes
@@ -96,34 +96,27 @@ def _content(
         counts = []
         for name, width, kinds, what in (("points", 3, "f", "floats"), ("bars", 2, "iu", "integers")):
             dataset = file.get(name)
-            refuse_if(
-                not isinstance(dataset, h5py.Dataset),
-                f"{path}: no dataset /{name}; a mesh has /points (n, 3) and /bars (n, 2)",
-            )
-            refuse_if(
-                dataset.ndim != 2 or dataset.shape[1] != width or dataset.dtype.kind not in kinds,
-                f"{path}: /{name} has shape {dataset.shape} and type {dataset.dtype}; expected (n, {width}) {what}",
-            )
+            if not isinstance(dataset, h5py.Dataset):
+                raise InputError(f"{path}: no dataset /{name}; a mesh has /points (n, 3) and /bars (n, 2)")
+            if dataset.ndim != 2 or dataset.shape[1] != width or dataset.dtype.kind not in kinds:
+                raise InputError(
+                    f"{path}: /{name} has shape {dataset.shape} and type {dataset.dtype}; expected (n, {width}) {what}"
+                )
             # Unwritten datasets need no space in the file, so a small file can declare any size.
             stored, declared = dataset.id.get_storage_size(), prod(dataset.shape) * dataset.dtype.itemsize
-            refuse_if(
-                declared > stored * (_COMPRESSION if dataset.chunks else 1),
-                f"{path}: /{name} declares {dataset.shape} values but holds {stored} bytes",
-            )
+            if declared > stored * (_COMPRESSION if dataset.chunks else 1):
+                raise InputError(f"{path}: /{name} declares {dataset.shape} values but holds {stored} bytes")
             counts.append(len(dataset))
         groups: dict[str, list[str]] = {}
         for kind in ("node_groups", "bar_groups"):
             group = file[kind] if kind in file else None  # noqa: SIM401 - get() hides what is wrong
-            refuse_if(
-                group is not None and not isinstance(group, h5py.Group), f"{path}: /{kind} is not a group of datasets"
-            )
+            if group is not None and not isinstance(group, h5py.Group):
+                raise InputError(f"{path}: /{kind} is not a group of datasets")
             groups[kind] = sorted(group or ())
             for name in groups[kind]:
                 dataset = group.get(name)
-                refuse_if(
-                    not isinstance(dataset, h5py.Dataset) or dataset.ndim != 1 or dataset.dtype.kind not in "iu",
-                    f"{path}: /{kind}/{name} is not a list of integers",
-                )
+                if not isinstance(dataset, h5py.Dataset) or dataset.ndim != 1 or dataset.dtype.kind not in "iu":
+                    raise InputError(f"{path}: /{kind}/{name} is not a list of integers")
         known = {}
         for kind, n in (("node_fields", counts[0]), ("bar_fields", counts[1])):
             group = file.get(kind)

@@ -21,7 +21,7 @@ from typing import Any
 
 import numpy as np
 
-from ..errors import InputError, refuse_if
+from ..errors import InputError
 from ..mesh.whole import WholeMesh
 from ._common import alike, free_name
 
@@ -52,7 +52,8 @@ def read(path: Path, fields: Collection[str] | None = None) -> WholeMesh:
     """
     deck = _deck(path)
     bars = [element for _, element in sorted(deck.elements.items())]
-    refuse_if(not bars, f"{path}: has no {', '.join(_BARS)}, which would be bars{_cards(deck, ': it has ')}")
+    if not bars:
+        raise InputError(f"{path}: has no {', '.join(_BARS)}, which would be bars{_cards(deck, ': it has ')}")
     pairs = [bar.node_ids[:2] for bar in bars]
     if (largest := max(map(max, pairs))) > sys.maxsize:
         raise InputError(f"{path}: GRID {largest}, at which a bar ends: a GRID has at most 8 digits in Nastran")

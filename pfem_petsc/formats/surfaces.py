@@ -17,7 +17,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..errors import InputError, refuse_if
+from ..errors import InputError
 from ..mesh.whole import WholeMesh
 from ._common import NumberStream, drop_bare_nodes, edges, numbers_of, whole_numbers
 
@@ -77,7 +77,8 @@ def read(path: Path, fields: Collection[str] | None = None) -> WholeMesh:
     of_faces = not (np.diff(content.lines.offsets) > 1).any()
     chosen = content.faces if of_faces else content.lines
     ends, owner = chosen.sides(closed=of_faces)
-    refuse_if(len(ends) == 0, f"{path}: has neither lines nor faces, whose edges would be bars")
+    if len(ends) == 0:
+        raise InputError(f"{path}: has neither lines nor faces, whose edges would be bars")
     bars = whole_numbers(ends, 0, n, f"{path}: there is no point ", f": the file has {n}, numbered from 0")
     bars, number = edges(bars) if of_faces else (bars, np.arange(len(bars)))
     members = {name: np.unique(number[np.isin(owner, own)]) for name, own in chosen.groups.items()}
@@ -172,7 +173,8 @@ _ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
 def _ply(path: Path) -> _Content:
     content = path.read_bytes()
     head = re.match(rb"(?:\xef\xbb\xbf)?ply\s*\n(.*?)end_header[ \t]*\r?\n", content, re.DOTALL)
-    refuse_if(head is None, f"{path}: is not PLY: it does not begin with 'ply' and a header")
+    if head is None:
+        raise InputError(f"{path}: is not PLY: it does not begin with 'ply' and a header")
     order, elements = _header(path, head[1].decode("ascii", "replace"))
     try:
         body = _Body(content[head.end() :], order)
@@ -211,7 +213,8 @@ def _header(path: Path, text: str) -> tuple[str, dict[str, tuple[int, Properties
                 pass
             case _:
                 raise InputError(f"{path}: the header has a line that is not known: {line[:60]!r}")
-    refuse_if(order is None, f"{path}: the header has no format; known: {', '.join(_ORDERS)}")
+    if order is None:
+        raise InputError(f"{path}: the header has no format; known: {', '.join(_ORDERS)}")
     return order, elements
 
 

@@ -19,7 +19,7 @@ from xml.sax.saxutils import escape, quoteattr
 
 import numpy as np
 
-from ..errors import InputError, refuse_if
+from ..errors import InputError
 from ..mesh.slab import check_memory
 from ..mesh.whole import WholeMesh
 from ._common import drop_bare_nodes, whole_numbers
@@ -75,11 +75,11 @@ def _model_name(path: Path, archive: zipfile.ZipFile) -> str:
 def _part(path: Path, archive: zipfile.ZipFile, name: str) -> IO[bytes]:
     """Open a part of the package, in which no part is mostly blanks."""
     part = archive.getinfo(name)
-    refuse_if(
-        part.file_size > max(_SMALL, _COMPRESSED * part.compress_size),
-        f"{path}: {name} has {part.file_size:,} bytes in {part.compress_size:,} compressed ones, as no lattice "
-        "has: the file is damaged: write it again",
-    )
+    if part.file_size > max(_SMALL, _COMPRESSED * part.compress_size):
+        raise InputError(
+            f"{path}: {name} has {part.file_size:,} bytes in {part.compress_size:,} compressed ones, as no lattice "
+            "has: the file is damaged: write it again"
+        )
     return archive.open(name)
 
 
@@ -159,7 +159,8 @@ class _Model:
                     self.node_groups[name] = _whole(found, 2**53, f"{where}: node group {name}: node")
                 case "model":
                     unit = get("unit", "millimeter")
-                    refuse_if(unit not in _UNITS, f"{where}: unit {unit!r}; known: {', '.join(_UNITS)}")
+                    if unit not in _UNITS:
+                        raise InputError(f"{where}: unit {unit!r}; known: {', '.join(_UNITS)}")
                     self.scale = _UNITS[unit]
                     required = [namespaces.get(prefix, prefix) for prefix in get("requiredextensions", "").split()]
                     self.not_read = [uri for uri in required if not uri.startswith(_LATTICES)]
@@ -167,11 +168,11 @@ class _Model:
 
     def _placed(self, element: ElementTree.Element) -> Placed:
         number = element.get("objectid", "")
-        refuse_if(
-            any(key.rpartition("}")[2] == "path" for key in element.attrib),
-            f"{self.where}: object {number} is in another part of the file (production extension), which is not "
-            "read: export without it",
-        )
+        if any(key.rpartition("}")[2] == "path" for key in element.attrib):
+            raise InputError(
+                f"{self.where}: object {number} is in another part of the file (production extension), which is not "
+                "read: export without it"
+            )
         numbers = element.get("transform", "1 0 0 0 1 0 0 0 1 0 0 0").split()
         return number, _numbers([tuple(numbers)], f"{self.where}: transform of object {number}", 12).reshape(4, 3)
 
@@ -183,11 +184,10 @@ class _Model:
         InputError
             If a component or item has no object, or has itself as a component.
         """
-        refuse_if(
-            number not in self.objects,
-            f"{self.where}: there is no object {number}, which the build or a component names",
-        )
-        refuse_if(depth > _DEEPEST, f"{self.where}: object {number} is a component of itself")
+        if number not in self.objects:
+            raise InputError(f"{self.where}: there is no object {number}, which the build or a component names")
+        if depth > _DEEPEST:
+            raise InputError(f"{self.where}: object {number} is a component of itself")
         if number not in self._sizes:
             found = self.objects[number]
             own = np.array([1, len(found.points) * bool(len(found.ends))], object)
@@ -221,14 +221,15 @@ def _whole(values: np.ndarray, n: int, what: str) -> np.ndarray:
 def _assembled(path: Path, model: _Model) -> WholeMesh:
     """Return the lattices of all items of the build as one mesh."""
     instances, nodes = sum((model.sizes(number) for number, _ in model.items), np.array([0, 0], object))
-    refuse_if(
-        instances > _INSTANCES,
-        f"{model.where}: the build places {instances:,} objects and components, and at most {_INSTANCES:,} are "
-        "read: write the lattice as fewer, larger objects",
-    )
+    if instances > _INSTANCES:
+        raise InputError(
+            f"{model.where}: the build places {instances:,} objects and components, and at most {_INSTANCES:,} are "
+            "read: write the lattice as fewer, larger objects"
+        )
     check_memory(nodes, str(path))
     placed = [each for item in model.items for each in model.placed(*item)]
-    refuse_if(not placed, f"{path}: has no beam lattice; a surface of triangles is read from STL")
+    if not placed:
+        raise InputError(f"{path}: has no beam lattice; a surface of triangles is read from STL")
     points, bars, radii = [], [], []
     node_groups, bar_groups = defaultdict(list), defaultdict(list)
     n_nodes = n_bars = 0
@@ -284,11 +285,11 @@ def write(path: Path, mesh: WholeMesh) -> None:
         If the bars have no areas.
     """
     area = mesh.bar_fields.get("area")
-    refuse_if(
-        area is None or not (area > 0.0).all(),
-        f"{path.name}: 3MF needs a radius of each bar, and the mesh has no field area with positive areas [m2]: "
-        "give one to all bars (--area of the verb mesh)",
-    )
+    if area is None or not (area > 0.0).all():
+        raise InputError(
+            f"{path.name}: 3MF needs a radius of each bar, and the mesh has no field area with positive areas [m2]: "
+            "give one to all bars (--area of the verb mesh)"
+        )
     with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
         archive.writestr("[Content_Types].xml", _TYPES)
         archive.writestr("_rels/.rels", _RELATIONS)

@@ -29,7 +29,7 @@ from xml.sax.saxutils import escape
 
 import numpy as np
 
-from ..errors import InputError, refuse_if
+from ..errors import InputError
 from ._common import drop_bare_nodes, edges
 
 if TYPE_CHECKING:
@@ -146,19 +146,17 @@ def _check_legacy(path: Path, grid: Any) -> None:
     cells = [getattr(grid, kind)() for kind in kinds if hasattr(grid, kind)]
     taken = sum(part.GetNumberOfCells() + part.GetNumberOfConnectivityIds() for part in cells)
     size = sum(int(count) for _, count in declared)
-    refuse_if(
-        taken != size, f"its cells need {taken} numbers, and it says that they have {size}: write it again", ValueError
-    )
+    if taken != size:
+        raise ValueError(f"its cells need {taken} numbers, and it says that they have {size}: write it again")
 
 
 def _arrays(grid: Any) -> Iterator[tuple[str, Any]]:
     from vtkmodules.util.numpy_support import vtk_to_numpy
 
-    refuse_if(
-        grid is None or not (grid.IsA("vtkUnstructuredGrid") or grid.IsA("vtkPolyData")),
-        f"holds a {grid.GetClassName() if grid else 'nothing'}, not an unstructured grid or polygonal data",
-        ValueError,
-    )
+    if grid is None or not (grid.IsA("vtkUnstructuredGrid") or grid.IsA("vtkPolyData")):
+        raise ValueError(
+            f"holds a {grid.GetClassName() if grid else 'nothing'}, not an unstructured grid or polygonal data"
+        )
     texts = grid.GetFieldData()
     if grid.IsA("vtkPolyData"):
         from vtkmodules.vtkFiltersCore import vtkAppendFilter
@@ -168,34 +166,24 @@ def _arrays(grid: Any) -> Iterator[tuple[str, Any]]:
         join.Update()
         grid = join.GetOutput()
     n_nodes, n_cells = grid.GetNumberOfPoints(), grid.GetNumberOfCells()
-    refuse_if(
-        n_nodes == 0 or n_cells == 0,
-        f"{n_nodes} points and {n_cells} cells: not a mesh of bars, or a damaged file",
-        ValueError,
-    )
+    if n_nodes == 0 or n_cells == 0:
+        raise ValueError(f"{n_nodes} points and {n_cells} cells: not a mesh of bars, or a damaged file")
     kinds = vtk_to_numpy(grid.GetCellTypesArray())
     lines = np.isin(kinds, (_LINE, _POLY_LINE))
     of_faces = not lines.any()
     cells = np.flatnonzero(np.isin(kinds, _FACES) if of_faces else lines)
-    refuse_if(
-        len(cells) == 0,
-        f"cells of types {np.unique(kinds).tolist()}; bars are lines (type 3) or edges of faces (types 5, 7, 9), "
-        "and there are none",
-        ValueError,
-    )
+    if len(cells) == 0:
+        raise ValueError(
+            f"cells of types {np.unique(kinds).tolist()}; bars are lines (type 3) or edges of faces (types 5, 7, 9), "
+            "and there are none"
+        )
     ends = vtk_to_numpy(grid.GetCells().GetConnectivityArray())
     offsets = vtk_to_numpy(grid.GetCells().GetOffsetsArray()).astype(np.int64)
     first, size = offsets[cells], offsets[cells + 1] - offsets[cells]
-    refuse_if(
-        np.any((size != 2) & (kinds[cells] == _LINE)) or np.any(size < 2),
-        "lines that do not have two ends; a bar has two",
-        ValueError,
-    )
-    refuse_if(
-        first.min() < 0 or (first + size).max() > len(ends),
-        "lines whose nodes do not exist: a damaged file",
-        ValueError,
-    )
+    if np.any((size != 2) & (kinds[cells] == _LINE)) or np.any(size < 2):
+        raise ValueError("lines that do not have two ends; a bar has two")
+    if first.min() < 0 or (first + size).max() > len(ends):
+        raise ValueError("lines whose nodes do not exist: a damaged file")
     for wrong in ends[(ends < 0) | (ends >= n_nodes)][:1]:
         raise ValueError(f"there is no point {wrong}, at which a cell ends: the file has {n_nodes}, numbered from 0")
     # a line of several points is as many bars less one, a face as many as it has corners: the cell of each bar, and
@@ -235,11 +223,8 @@ def _groups_of(data: Any, fields: Any, kept: slice | np.ndarray) -> dict[str, np
     }
     for array in [name for name in _NAMED if data.GetArray(name) is not None]:
         values = arrays.get(array)
-        refuse_if(
-            values is None or not np.array_equal(values, np.rint(values)),
-            f"array {array!r} must hold one whole number for each",
-            ValueError,
-        )
+        if values is None or not np.array_equal(values, np.rint(values)):
+            raise ValueError(f"array {array!r} must hold one whole number for each")
         values, names = values[kept].astype(np.int64), fields.GetAbstractArray(f"{array}_names")
         n_names = names.GetNumberOfValues() if names is not None and names.IsA("vtkStringArray") else 0
         for i in np.unique(values[values >= 0]).tolist():
@@ -273,7 +258,8 @@ def write(path: Path, mesh: WholeMesh) -> None:
     # VTK writes names into XML as they are
     named = str if legacy else partial(escape, entities={'"': "&quot;", "\t": "&#9;", "\n": "&#10;", "\r": "&#13;"})
     writer.SetInputData(grid_of(mesh, named, polygonal=path.suffix.lower() == ".vtp"))
-    refuse_if(not writer.Write() or not path.is_file(), f"{path}: VTK could not write the file; is there room?")
+    if not writer.Write() or not path.is_file():
+        raise InputError(f"{path}: VTK could not write the file; is there room?")
 
 
 def grid_of(mesh: WholeMesh, named: Callable[[str], str] = str, polygonal: bool = False) -> pyvista.DataSet:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from mpi4py import MPI
 
-from ..errors import InputError, refuse_if
+from ..errors import InputError
 from ..parallel.natural import NaturalOrder
 from ..registry import nearest
 from .exchange import GhostExchange, Messages, Router
@@ -288,10 +288,8 @@ def resolve_node_sets(case: Case, mesh: DistributedMesh) -> dict[str, np.ndarray
     for name, node_set in case.node_set.items():
         where = f"{case.source}: node_set.{name}"
         members = _members_of(case, where, node_set, mesh)
-        refuse_if(
-            mesh.comm.allreduce(len(members)) == 0,
-            f"{where}: no node of the mesh is in this set; correct the box or the group",
-        )
+        if mesh.comm.allreduce(len(members)) == 0:
+            raise InputError(f"{where}: no node of the mesh is in this set; correct the box or the group")
         sets[name] = members.astype(np.int64)
     return sets
 

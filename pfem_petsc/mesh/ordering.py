@@ -11,7 +11,7 @@ from .exchange import Router
 from .slab import MeshSlab, slab_of
 
 BITS = 21
-"""Bits of each coordinate in a key: three times this fits in an int64."""
+"""Bits of each coordinate in a key: three times this fits in 64 bits."""
 
 NODE_BLOCK = 512
 """Number of nodes whose bars and node loops follow each other, so that their data stay in the cache."""
@@ -35,6 +35,71 @@ _STEPS = 1 << 20
 _PIECE = 1 << 15
 
 _BARS = 1 << 18  # bars sorted at a time, to keep temporary arrays small
+
+
+def hilbert_keys(points: np.ndarray, low: np.ndarray, extent: float) -> np.ndarray:
+    """Return the positions of points along the Hilbert curve through the cube that starts at ``low``.
+
+    Parameters
+    ----------
+    points : (n, 3) float64 [m]
+    low : (3,) float64 [m]
+        Lowest corner of the points of the whole mesh.
+    extent : float [m]
+        Edge of the cube: the largest extent of the whole mesh.
+
+    Returns
+    -------
+    keys : (n,) uint64
+
+    Notes
+    -----
+    J. Skilling, "Programming the Hilbert curve", AIP Conf. Proc. 707 (2004), 381-387.
+    """
+    keys = np.empty(len(points), np.uint64)
+    # The last cell is closed at its upper end; a mesh of zero extent (a single node) is in one cell.
+    scale = ((1 << BITS) - 0.5) / extent if extent > 0.0 else 0.0
+    for first in range(0, len(points), _PIECE):
+        piece = slice(first, first + _PIECE)
+        cells = ((points[piece] - low) * scale).astype(np.uint32)
+        keys[piece] = _hilbert([np.ascontiguousarray(cells[:, axis]) for axis in range(3)])
+    return keys
+
+
+def _hilbert(x: list[np.ndarray]) -> np.ndarray:
+    """Apply Skilling's transform of cell coordinates (three arrays of uint32, changed in place) to positions."""
+    for bit in range(BITS - 1, 0, -1):
+        q = np.uint32(1 << bit)
+        lower = np.uint32((1 << bit) - 1)
+        for axis in range(3):
+            # Where the bit is set, invert the lower bits of x; elsewhere exchange them with those of this axis.
+            is_set = (x[axis] & q) != 0
+            exchanged = np.where(is_set, np.uint32(0), (x[0] ^ x[axis]) & lower)
+            x[0] ^= np.where(is_set, lower, exchanged)
+            x[axis] ^= exchanged
+    x[1] ^= x[0]
+    x[2] ^= x[1]
+    twist = np.zeros_like(x[0])
+    for bit in range(BITS - 1, 0, -1):
+        twist ^= np.where((x[2] & np.uint32(1 << bit)) != 0, np.uint32((1 << bit) - 1), np.uint32(0))
+    keys = np.zeros(len(x[0]), np.uint64)
+    for axis in range(3):
+        keys |= _spread(x[axis] ^ twist) << np.uint64(2 - axis)
+    return keys
+
+
+def _spread(x: np.ndarray) -> np.ndarray:
+    """Insert two zero bits between the bits of 21-bit numbers."""
+    x = x.astype(np.uint64)
+    for shift, mask in (
+        (32, 0x001F00000000FFFF),
+        (16, 0x001F0000FF0000FF),
+        (8, 0x100F00F00F00F00F),
+        (4, 0x10C30C30C30C30C3),
+        (2, 0x1249249249249249),
+    ):
+        x = (x | (x << np.uint64(shift))) & np.uint64(mask)
+    return x
 
 
 def sweep_axes(low: np.ndarray, high: np.ndarray) -> tuple[int, ...]:
@@ -188,7 +253,7 @@ UNEVEN = 1.1
 
 _OF_NODE = 4  # work of a node in an explicit step, where that of a bar is 2
 
-# Candidate positions tested at once for a border between two parts.
+# Candidate positions tested at once for each border between two ranks.
 _CANDIDATES = 256
 
 _BARS_SENT = 1 << 18  # number of bars whose ends are sent at a time, to keep temporary arrays small
@@ -197,8 +262,8 @@ _BARS_SENT = 1 << 18  # number of bars whose ends are sent at a time, to keep te
 def partition(slab: MeshSlab, comm: MPI.Comm) -> tuple[np.ndarray, str]:
     """Compute the owner of every node of this rank's slab. Collective.
 
-    PT-Scotch cuts few bars, for equal numbers of nodes. Recursive bisection of their box into parts of equal work,
-    independent of the slabs, serves structured meshes, a PETSc without PT-Scotch, and meshes of which a
+    PT-Scotch cuts few bars, for equal numbers of nodes. A space-filling curve through the nodes divided into parts of
+    equal work, independent of the slabs, serves structured meshes, a PETSc without PT-Scotch, and meshes of which a
     rank would have over :data:`UNEVEN` times the mean work, because nodes have very different numbers of bars. Both are
     reproducible from run to run; PT-Scotch uses random numbers that continue from call to call, so a second call in one
     process may differ.
@@ -240,46 +305,27 @@ def _works(slab: MeshSlab, comm: MPI.Comm) -> np.ndarray:
 
 
 def _by_coordinates(slab: MeshSlab, works: np.ndarray, comm: MPI.Comm) -> np.ndarray:
-    """Cut the mesh into parts of equal ``works``, integers, each across its longest extent (recursive bisection).
+    """Divide the Hilbert curve through the nodes such that ranks have equal ``works``, integers.
 
-    The result depends on the nodes, their works and the number of ranks only.
+    The borders are found by summing works below candidate positions, refined around each border, so the result depends
+    on the nodes, their works and the number of ranks only.
     """
     low, high = bounding_box(slab.points, comm)
-    scale = ((1 << BITS) - 0.5) / (float((high - low).max()) or 1.0)
-    cells, owners = ((slab.points - low) * scale).astype(np.int64), np.empty(len(slab.points), np.int32)
-
-    def cut(members: np.ndarray, first: int, count: int) -> None:
-        """Give members (m,) of the nodes here to a number of ranks from the first on."""
-        if count == 1:
-            owners[members] = first
-            return
-        # nodes of one plane are divided by rows, those of one row by columns
-        axes = sweep_axes(*bounding_box(slab.points[members], comm))
-        layers, middle, rows = cells[members][:, axes].T
-        keys, half = (((layers << BITS) + middle) << BITS) + rows, count // 2
-        lower = keys <= _border(keys, works[members], half / count, comm)
-        cut(members[lower], first, half)
-        cut(members[~lower], first + half, count - half)
-
-    cut(np.arange(len(owners)), 0, comm.size)
-    return owners
-
-
-def _border(keys: np.ndarray, works: np.ndarray, share: float, comm: MPI.Comm) -> int:
-    """Return the key up to which nodes, of all ranks, have a share of the work, within half of that of a node."""
+    keys = hilbert_keys(slab.points, low, float((high - low).max()))
     order = np.argsort(keys)
     in_order, sums = keys[order], np.concatenate([[0], np.cumsum(works[order])])
-    half = 0.5 * comm.allreduce(int(works.max(initial=0)), op=MPI.MAX)
-    wanted = share * comm.allreduce(int(sums[-1])) - half
-    # invariant: less work than wanted lies below `low`, at least as much below `low + width`
-    low, width = 0, 1 << (3 * BITS)
+    wanted = (comm.allreduce(int(sums[-1])) * np.arange(1, comm.size)) // comm.size
+    # Invariant: less work than required lies below `low`, at least as much below `high`.
+    low = np.zeros(comm.size - 1, np.uint64)
+    width = 1 << (3 * BITS)
     while width > 1:
-        width = max(width // _CANDIDATES, 1)
-        candidates = low + width * np.arange(1, _CANDIDATES, dtype=np.int64)
-        below = sums[np.searchsorted(in_order, candidates)]
+        step = max(width // _CANDIDATES, 1)
+        candidates = low[:, None] + np.uint64(step) * np.arange(1, _CANDIDATES + 1, dtype=np.uint64)
+        below = sums[np.searchsorted(in_order, candidates.ravel(), side="left")].reshape(candidates.shape)
         comm.Allreduce(MPI.IN_PLACE, below, op=MPI.SUM)
-        low += width * int((below < wanted).sum())
-    return low
+        low += np.uint64(step) * (below < wanted[:, None]).sum(axis=1).astype(np.uint64)
+        width = step
+    return np.searchsorted(low, keys, side="left").astype(np.int32)
 
 
 def _by_graph(slab: MeshSlab, comm: MPI.Comm) -> np.ndarray | None:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from mpi4py import MPI
 
-from ..errors import InputError, refuse_if
+from ..errors import InputError
 from ..files import memory_of_machine
 from .exchange import Router
 
@@ -116,11 +116,11 @@ def check_size(n_nodes: int, where: str, n_bars: int = 0) -> None:
     from petsc4py import PETSc
 
     limit = int(np.iinfo(PETSc.IntType).max)
-    refuse_if(
-        3 * n_nodes > limit,
-        f"{where}: {n_nodes:,} nodes have {3 * n_nodes:,} unknowns, more than this PETSc can number ({limit:,}): "
-        "make the mesh smaller, or use a PETSc configured with 64-bit indices",
-    )
+    if 3 * n_nodes > limit:
+        raise InputError(
+            f"{where}: {n_nodes:,} nodes have {3 * n_nodes:,} unknowns, more than this PETSc can number ({limit:,}): "
+            "make the mesh smaller, or use a PETSc configured with 64-bit indices"
+        )
     check_memory(n_nodes, where, n_bars)
 
 
@@ -148,10 +148,10 @@ def check_length(value: float, where: str) -> None:
     InputError
         If the length is outside 1e-150 to 1e150.
     """
-    refuse_if(
-        not 1e-150 < value < 1e150,
-        f"{where}: length {value:g} m overflows double precision when squared; choose one between 1e-150 and 1e150",
-    )
+    if not 1e-150 < value < 1e150:
+        raise InputError(
+            f"{where}: length {value:g} m overflows double precision when squared; choose one between 1e-150 and 1e150"
+        )
 
 
 def slab_of_whole(
@@ -259,17 +259,14 @@ def _field(source: str, name: str, values: ArrayLike, n: int) -> np.ndarray:
     """Return the values of a cell field."""
     where, array = f"{source}: bar_fields[{name!r}]", np.asarray(values)
     _check_name(where, name)
-    refuse_if(
-        array.shape != (n,) or array.dtype.kind not in "fiu",
-        f"{where} has shape {array.shape} and type {array.dtype}; expected ({n},) numbers",
-    )
+    if array.shape != (n,) or array.dtype.kind not in "fiu":
+        raise InputError(f"{where} has shape {array.shape} and type {array.dtype}; expected ({n},) numbers")
     return array.astype(np.float64)
 
 
 def _check_name(where: str, name: str) -> None:
-    refuse_if(
-        not isinstance(name, str) or not name or "/" in name or name == ".", f"{where}: expected a name without slashes"
-    )
+    if not isinstance(name, str) or not name or "/" in name or name == ".":
+        raise InputError(f"{where}: expected a name without slashes")
 
 
 def _members(source: str, kind: str, name: str, values: ArrayLike, n: int) -> np.ndarray:
@@ -279,11 +276,11 @@ def _members(source: str, kind: str, name: str, values: ArrayLike, n: int) -> np
     if array.dtype.kind == "b" and array.shape == (n,):
         return np.flatnonzero(array)
     array = array if array.size else np.empty(0, np.int64)
-    refuse_if(
-        array.ndim != 1 or array.dtype.kind not in "iu",
-        f"{where} has shape {array.shape} and type {array.dtype}; expected a list of numbers from 0, or ({n},) "
-        "booleans",
-    )
+    if array.ndim != 1 or array.dtype.kind not in "iu":
+        raise InputError(
+            f"{where} has shape {array.shape} and type {array.dtype}; expected a list of numbers from 0, or ({n},) "
+            "booleans"
+        )
     for wrong in array[(array < 0) | (array >= n)][:1]:
         raise InputError(f"{where} has member {wrong}, but numbers go from 0 to {n - 1}")
     return np.unique(array.astype(np.int64))

@@ -13,7 +13,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 
-from ..errors import InputError, refuse_if
+from ..errors import InputError
 from .whole import WholeMesh, check_numbers
 
 MERGED = 1e-6
@@ -182,7 +182,8 @@ def refined(mesh: WholeMesh, n: int) -> WholeMesh:
     Bar k becomes the bars from n k to n k + n - 1, with its groups and fields; new nodes are numbered after the others,
     and have NaN in fields of nodes.
     """
-    refuse_if(n < 1, f"refine: {n} parts of a bar; expected a whole number from 1 on")
+    if n < 1:
+        raise InputError(f"refine: {n} parts of a bar; expected a whole number from 1 on")
     old, count = len(mesh.points), len(mesh.bars)
     (start, end), share = mesh.points[mesh.bars.T][..., None, :], (np.arange(1, n) / n)[:, None]
     inner = (start * (1.0 - share) + end * share).reshape(-1, 3)
@@ -209,7 +210,8 @@ def scaled(mesh: WholeMesh, scale: float) -> WholeMesh:
     stresses of materials by its power -2, densities by its power -4 (tonnes per cubic millimetre with 0.001), and what
     else the tables have likewise.
     """
-    refuse_if(not 0.0 < scale < np.inf, f"scale: {scale!r} is not a positive number of metres in a unit of the file")
+    if not 0.0 < scale < np.inf:
+        raise InputError(f"scale: {scale!r} is not a positive number of metres in a unit of the file")
     if scale == 1.0:
         return mesh
     fields = {name: values * scale**2 if name == "area" else values for name, values in mesh.bar_fields.items()}

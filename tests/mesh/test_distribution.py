@@ -4,6 +4,7 @@ from helpers.meshes import slab_from, whole
 
 from pfem_petsc.mesh.distribution import distribute
 from pfem_petsc.mesh.generators import lattice
+from pfem_petsc.mesh.ordering import hilbert_keys
 
 PARTITIONERS = ["coordinates", "ptscotch"]
 
@@ -60,16 +61,12 @@ def test_partitioner_is_chosen_by_the_mesh(comm):
         assert (mesh.partitioner == one_rank) == (comm.size == 1)
 
 
-@pytest.mark.parallel
-def test_a_long_block_is_cut_across(comm):
-    """Parts of a long lattice lie one after the other along it, and few bars are cut."""
-    slab = lattice.generate(lattice.Parameters(kind="cubic", cells=[3, 60, 4], pitch=1.0), comm.rank, comm.size)
-    mesh = distribute(slab, np.zeros(len(slab.bars), np.int32), comm)
-    own = mesh.points[: mesh.n_owned, 1]
-    ranges = comm.allgather((own.min(), own.max()))
-    assert all(high <= low for (_, high), (low, _) in zip(ranges, ranges[1:]))
-    assert len(mesh.ghost_numbers) <= 2 * 2 * 4 * 5  # up to two layers at each border, as one may be divided
-    mesh.close()
+def test_hilbert_curve_visits_neighbour_after_neighbour():
+    n = 8
+    points = np.indices((n, n, n)).reshape(3, -1).T.astype(float)
+    order = np.argsort(hilbert_keys(points, np.zeros(3), float(n - 1)))
+    steps = np.abs(np.diff(points[order], axis=0)).sum(axis=1)
+    np.testing.assert_array_equal(steps, 1.0)
 
 
 def test_bars_lie_close_to_each_other_in_memory(comm):

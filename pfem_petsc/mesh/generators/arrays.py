@@ -13,7 +13,7 @@ from mpi4py import MPI
 from pydantic import model_validator
 
 from ...case.base import StrictModel
-from ...errors import InputError, refuse_if
+from ...errors import InputError
 from ...parallel.agreement import agreed, on_root
 from ..slab import MeshSlab, check_size, slab_from_arrays
 from ..whole import WholeMesh, case_tables, check_fields, check_mesh, scattered, without_slashes
@@ -191,9 +191,8 @@ class Truss:
         return grid_of(self.to_mesh())
 
     def _require(self, what: str) -> None:
-        refuse_if(
-            self.points is None, f"Truss: only rank 0 has the arrays of this truss, which cannot be {what} elsewhere"
-        )
+        if self.points is None:
+            raise InputError(f"Truss: only rank 0 has the arrays of this truss, which cannot be {what} elsewhere")
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, Truss) and self.digest == other.digest
@@ -328,11 +327,11 @@ def generate_on(
             f"mesh: the arrays of rank {rank} differ from those of rank 0: give all ranks the same arrays, or rank 0 "
             "alone, by Truss(..., comm=comm)"
         )
-    refuse_if(
-        not found[0][1],  # nobody has, or not the one that would send them
-        f"mesh: the arrays of this case (digest {str(digest)[:12]}...) are not in its text, as they are large: "
-        "give the truss, as in Case.load(path, mesh=truss)",
-    )
+    if not found[0][1]:
+        raise InputError(
+            f"mesh: the arrays of this case (digest {str(digest)[:12]}...) are not in its text, as they are large: "
+            "give the truss, as in Case.load(path, mesh=truss)"
+        )
     with agreed(comm):
         if comm.rank == 0:
             check_fields("mesh", fields, truss.bar_fields)

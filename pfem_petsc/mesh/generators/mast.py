@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from ...case.base import PositiveInt, StrictModel
-from ...errors import refuse_if
+from ...errors import InputError
 from ..slab import MeshSlab, check_size, slab_of_whole
 from .base import Length
 
@@ -36,9 +36,8 @@ def generate(parameters: Parameters, rank: int, size: int) -> MeshSlab:
     ``guys``.
     """
     p, n = parameters, parameters.bays
-    refuse_if(
-        p.levels > n, f"mesh.levels = {p.levels} is more than mesh.bays = {n}: guys are attached at the bays' ends"
-    )
+    if p.levels > n:
+        raise InputError(f"mesh.levels = {p.levels} is more than mesh.bays = {n}: guys are attached at the bays' ends")
     n_mast, n_guys = 3 * (n + 1), 3 * p.levels
     check_size(n_mast + 3 + n_guys * (p.elements - 1), "mesh.bays", 9 * n + 3 + n_guys * p.elements)
     leg = np.arange(3)

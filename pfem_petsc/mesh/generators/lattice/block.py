@@ -26,7 +26,7 @@ from ....case.base import (
     is_finite_number,
     listed,
 )
-from ....errors import InputError, refuse_if
+from ....errors import InputError
 from ...slab import check_length, check_size
 from ..base import Length
 from .cells import ANGLE, KINDS, UnitCell, auxetic, cell_of
@@ -51,20 +51,17 @@ class CellKeys(StrictModel):
     @model_validator(mode="after")
     def _joined(self) -> CellKeys:
         count = len(self.points)
-        refuse_if(not self.points or not self.struts, "expected at least one point and one strut", ValueError)
+        if not self.points or not self.struts:
+            raise ValueError("expected at least one point and one strut")
         for number, strut in enumerate(self.struts):
             where = f"struts[{number}] = {list(strut)}"
-            refuse_if(
-                len(strut) not in (2, 5) or not all(0 <= p < count for p in strut[:2]),
-                f"{where}: expected two numbers of points, 0 to {count - 1}, or these and the cell (i, j, k) of "
-                "the second one",
-                ValueError,
-            )
-            refuse_if(
-                any(abs(i) > 1 for i in strut[2:]),
-                f"{where}: expected -1, 0 or 1 for the cell of the second point",
-                ValueError,
-            )
+            if len(strut) not in (2, 5) or not all(0 <= p < count for p in strut[:2]):
+                raise ValueError(
+                    f"{where}: expected two numbers of points, 0 to {count - 1}, or these and the cell (i, j, k) of "
+                    "the second one"
+                )
+            if any(abs(i) > 1 for i in strut[2:]):
+                raise ValueError(f"{where}: expected -1, 0 or 1 for the cell of the second point")
         for name, members in (self.groups or {}).items():
             for wrong in [m for m in members if m >= len(self.struts)][:1]:
                 raise ValueError(f"groups.{name}: there is no strut {wrong}: they go from 0 to {len(self.struts) - 1}")
@@ -203,11 +200,8 @@ class Parameters(StrictModel):
     def _factors(cls, value: Any) -> Any:
         if value is None:
             return None
-        refuse_if(
-            not isinstance(value, list | tuple) or len(value) != 3,
-            'expected three factors on the pitch along x, y and z, like [1, 1, "1 + 2*z"]',
-            ValueError,
-        )
+        if not isinstance(value, list | tuple) or len(value) != 3:
+            raise ValueError('expected three factors on the pitch along x, y and z, like [1, 1, "1 + 2*z"]')
         for axis, factor in zip(COORDINATES, value):
             if isinstance(factor, str):
                 Expression(factor, (axis,))
@@ -218,11 +212,8 @@ class Parameters(StrictModel):
     @model_validator(mode="after")
     def _consistent(self) -> Parameters:
         for name in self.fields or {}:
-            refuse_if(
-                not can_be_variable(name),
-                f"fields.{name}: expected a name of letters, digits and underscores",
-                ValueError,
-            )
+            if not can_be_variable(name):
+                raise ValueError(f"fields.{name}: expected a name of letters, digits and underscores")
         self.expressions()
         return self
 
@@ -472,11 +463,11 @@ class Block(Joints):
         self.disturbed = self._amplitude > 0.0
         edges = [np.diff(level[:-1]).min() for level in self._levels]
         shortest = float(np.linalg.norm(cell.spans * np.array(edges), axis=1).min())
-        refuse_if(
-            self._amplitude and 2.0 * math.sqrt(3.0) * self._amplitude >= shortest,
-            f"mesh.perturbation = {keys.perturbation!r}: ends of a strut of {shortest:.4g} m could meet; choose "
-            f"less than {shortest / (2.0 * math.sqrt(3.0) * keys.pitch):.4g}",
-        )
+        if self._amplitude and 2.0 * math.sqrt(3.0) * self._amplitude >= shortest:
+            raise InputError(
+                f"mesh.perturbation = {keys.perturbation!r}: ends of a strut of {shortest:.4g} m could meet; choose "
+                f"less than {shortest / (2.0 * math.sqrt(3.0) * keys.pitch):.4g}"
+            )
         sizes = zip(self.cells / np.array(cell.layers), self._levels)
         self._extents = np.array([np.interp(size, np.arange(len(level)), level) for size, level in sizes])
         farthest = float(np.abs(keys.origin or 0.0).max()) + float(self._extents.max())
@@ -493,19 +484,19 @@ class Block(Joints):
         curved, extents = self.keys.curved, self._extents
         inner, outer = curved.radius, curved.radius + float(extents[2])
         if curved.shape == "cylinder":
-            refuse_if(
-                not self.closed and extents[0] > 2.0 * np.pi * inner * (1.0 + 1e-9),
-                f"mesh.curved.radius = {inner!r}: the block is {extents[0]:.6g} m long, more than the "
-                f"circumference of {2.0 * np.pi * inner:.6g} m; use fewer cells, or closed = true",
-            )
+            if not self.closed and extents[0] > 2.0 * np.pi * inner * (1.0 + 1e-9):
+                raise InputError(
+                    f"mesh.curved.radius = {inner!r}: the block is {extents[0]:.6g} m long, more than the "
+                    f"circumference of {2.0 * np.pi * inner:.6g} m; use fewer cells, or closed = true"
+                )
             angle = 2.0 * np.pi if self.closed else extents[0] / inner
             return float(0.5 * angle * (outer**2 - inner**2) * extents[1])
         half = 0.5 * extents[:2] / inner
-        refuse_if(
-            half.max() >= 0.45 * np.pi,
-            f"mesh.curved.radius = {inner!r}: the block spans {np.degrees(2.0 * half.max()):.0f} degrees of the "
-            "sphere; at most 160 are mapped: use fewer cells or a larger radius",
-        )
+        if half.max() >= 0.45 * np.pi:
+            raise InputError(
+                f"mesh.curved.radius = {inner!r}: the block spans {np.degrees(2.0 * half.max()):.0f} degrees of the "
+                "sphere; at most 160 are mapped: use fewer cells or a larger radius"
+            )
         solid_angle = 4.0 * np.arcsin(np.sin(half[0]) * np.sin(half[1]))
         return float(solid_angle * (outer**3 - inner**3) / 3.0)
 
@@ -596,10 +587,10 @@ def _borders(edge: float, factor: str, axis: int) -> Iterator[float]:
 
     def slope(x: float) -> float:
         value = float(expression({name: np.array([x])})[0])
-        refuse_if(
-            not (np.isfinite(value) and value > 0.0),
-            f"mesh.grading[{axis}]: {factor!r} is {value:g} at {name} = {x:g} m; expected a factor > 0 in the block",
-        )
+        if not (np.isfinite(value) and value > 0.0):
+            raise InputError(
+                f"mesh.grading[{axis}]: {factor!r} is {value:g} at {name} = {x:g} m; expected a factor > 0 in the block"
+            )
         return edge * value
 
     x, h = 0.0, 1.0 / _STEPS
@@ -632,11 +623,11 @@ def fitted(keys: Parameters, surface: Surface) -> Parameters:
     for axis, factor in enumerate(keys.grading or (1.0, 1.0, 1.0)):
         edge = keys.pitch * cell.aspect[axis]
         if isinstance(factor, str):
-            refuse_if(
-                origin[axis] > low[axis] + 1e-9 * edge,
-                f"mesh.grading[{axis}] = {factor!r}: an expression begins at mesh.origin, and the surface below it "
-                f"would stay empty: use {COORDINATES[axis]} = {low[axis]:.9g} or less there, or leave the key out",
-            )
+            if origin[axis] > low[axis] + 1e-9 * edge:
+                raise InputError(
+                    f"mesh.grading[{axis}] = {factor!r}: an expression begins at mesh.origin, and the surface below it "
+                    f"would stay empty: use {COORDINATES[axis]} = {low[axis]:.9g} or less there, or leave the key out"
+                )
             count[axis] = graded_count(float(high[axis] - origin[axis]), edge, factor, axis)
             continue
         first = np.floor((low[axis] - origin[axis]) / (edge * factor) + 1e-9)
@@ -645,9 +636,8 @@ def fitted(keys: Parameters, surface: Surface) -> Parameters:
     size = f"a surface of {' x '.join(f'{length:.4g}' for length in high - low)} m"
     if keys.surface.scale == 1.0:
         size += " (if its file is in millimetres, set mesh.surface.scale = 0.001)"
-    refuse_if(
-        not (count < float(np.iinfo(np.int64).max) / 16.0).all(), f"mesh.pitch = {keys.pitch!r}: too small for {size}"
-    )
+    if not (count < float(np.iinfo(np.int64).max) / 16.0).all():
+        raise InputError(f"mesh.pitch = {keys.pitch!r}: too small for {size}")
     check_size(
         math.prod(int(number) for number in count.tolist()),
         f"mesh.pitch = {keys.pitch!r}, with cells that cover {size}",

@@ -8,8 +8,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ....errors import refuse_if
-
 _SAME = 1e-9
 """Points of a cell closer than this, in cell edges, are one; coordinates this close to a face are on it."""
 
@@ -90,7 +88,8 @@ def cell_of(
         at = np.array([whole[p], whole[q] + np.array(row[2:5] if len(row) > 2 else (0, 0, 0), dtype=np.int64)])
         at -= at.min(axis=0)
         one, two = (int(number[p]), *at[0].tolist()), (int(number[q]), *at[1].tolist())
-        refuse_if(one == two, f"strut {len(strut_of)} ({list(row)}) has no length: its ends coincide", ValueError)
+        if one == two:
+            raise ValueError(f"strut {len(strut_of)} ({list(row)}) has no length: its ends coincide")
         key = next((k for k in ((*one, *two), (*two, *one)) if k in found), (*one, *two))
         strut_of.append(found.setdefault(key, len(found)))
     rows = np.array(list(found), dtype=np.int64).reshape(-1, 2, 4)

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ....case.base import is_finite_number
-from ....errors import InputError, refuse_if
+from ....errors import InputError
 from ....files import readable_whole
 
 if TYPE_CHECKING:
@@ -80,7 +80,8 @@ class Expression:
 
     def __init__(self, text: str, variables: tuple[str, ...] = COORDINATES) -> None:
         self.text, self.variables = text, variables
-        refuse_if(len(text) > _LONGEST, f"the expression has {len(text)} characters, more than {_LONGEST}", ValueError)
+        if len(text) > _LONGEST:
+            raise ValueError(f"the expression has {len(text)} characters, more than {_LONGEST}")
         # each node of the tree before its parts, the last part first; without recursion, for long sums
         self._steps: list[tuple[str | Callable[..., Any], int]] = []
         try:
@@ -110,7 +111,8 @@ class Expression:
         """Return what gives the value of a node of the tree, a variable or a function of its parts, and these."""
         match node:
             case ast.Constant(value):
-                refuse_if(not is_finite_number(value), f"{ast.unparse(node)} is not a number", ValueError)
+                if not is_finite_number(value):
+                    raise ValueError(f"{ast.unparse(node)} is not a number")
                 return lambda: float(value), []
             case ast.Name(name):
                 if name in self.variables:
@@ -132,9 +134,8 @@ class Expression:
                     np.logical_and, [compare(a, b) for compare, a, b in zip(functions, values, values[1:])]
                 ), [left, *others]
             case ast.Call(ast.Name(name), parts, keywords):
-                refuse_if(
-                    name not in _FUNCTIONS, f"unknown function {name!r}; known: {', '.join(_FUNCTIONS)}", ValueError
-                )
+                if name not in _FUNCTIONS:
+                    raise ValueError(f"unknown function {name!r}; known: {', '.join(_FUNCTIONS)}")
                 function, wanted = _FUNCTIONS[name]
                 if keywords or (len(parts) != wanted if wanted > 0 else len(parts) < -wanted):
                     expected = f"{wanted} argument{'s' * (wanted > 1)}" if wanted > 0 else "two or more arguments"
@@ -214,9 +215,8 @@ class MeshField:
 
         path, array, where = self._path, self._array, f"{self._key}.file: {self._path}"
         mesh = read_vtk(path, where)
-        refuse_if(
-            not isinstance(mesh, pyvista.DataSet) or mesh.n_cells == 0, f"{where}: has no cells to take a field from"
-        )
+        if not isinstance(mesh, pyvista.DataSet) or mesh.n_cells == 0:
+            raise InputError(f"{where}: has no cells to take a field from")
         of_points = array in mesh.point_data
         data = mesh.point_data if of_points else mesh.cell_data
         if array not in data or data[array].ndim != 1 or data[array].dtype.kind not in "fiu":

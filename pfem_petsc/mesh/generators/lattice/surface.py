@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ....errors import InputError, refuse_if
+from ....errors import InputError
 from ...tools import components
 from .expressions import read_vtk
 
@@ -327,15 +327,12 @@ def read_surface(path: Path, scale: float) -> Surface:
         If the file is not there, is not of triangles, or the surface is open.
     """
     where = f"mesh.surface.file: {path}"
-    refuse_if(
-        path.suffix.lower() not in _SUFFIXES,
-        f"{where}: no reader for {path.suffix or 'no suffix'}; known: {', '.join(_SUFFIXES)}",
-    )
+    if path.suffix.lower() not in _SUFFIXES:
+        raise InputError(f"{where}: no reader for {path.suffix or 'no suffix'}; known: {', '.join(_SUFFIXES)}")
     data = read_vtk(path, where)
     points, triangles = _triangles(data)
-    refuse_if(
-        len(triangles) == 0 or not np.isfinite(points).all(), f"{where}: no surface of triangles could be read from it"
-    )
+    if len(triangles) == 0 or not np.isfinite(points).all():
+        raise InputError(f"{where}: no surface of triangles could be read from it")
     count, edge = _open_edges(triangles)
     if count:
         merged = _triangles(data, _MERGED)
@@ -349,7 +346,8 @@ def read_surface(path: Path, scale: float) -> Surface:
             f"from ({a}) to ({b}) in the file; close it in the program that made it (PyVista: mesh.fill_holes(size))"
         )
     surface = bodies_of(points, triangles, where)
-    refuse_if(not surface.bodies, f"{where}: the surface encloses no volume")
+    if not surface.bodies:
+        raise InputError(f"{where}: the surface encloses no volume")
     surface.points = scale * points
     return surface
 

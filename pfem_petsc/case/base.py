@@ -10,7 +10,7 @@ import ast
 import inspect
 import sys
 import textwrap
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import cache
 from itertools import pairwise
 from pathlib import Path
@@ -83,6 +83,9 @@ class StrictModel(BaseModel):
     """Groups of keys, of each of which the table has exactly one."""
     at_most_one: ClassVar[tuple[tuple[str, ...], ...]] = ()
     """Groups of keys, of each of which the table has at most one."""
+    conflicts: ClassVar[tuple[tuple[Callable[[Any], object], str], ...]] = ()
+    """What keys of the table must not be together: a test of the table, and the message, which is formatted with it.
+    Those of base classes come first."""
 
     @classmethod
     def description(cls, key: str) -> str:
@@ -95,9 +98,13 @@ class StrictModel(BaseModel):
         for groups, least, many in ((self.exactly_one, 1, "exactly"), (self.at_most_one, 0, "at most")):
             for keys in groups:
                 given = [key for key in keys if getattr(self, key) is not None]
+                text = f"expected {many} one of the keys {', '.join(keys)}, got {' and '.join(given) or 'none'}"
                 if not least <= len(given) <= 1:
-                    got = " and ".join(given) or "none"
-                    raise ValueError(f"expected {many} one of the keys {', '.join(keys)}, got {got}")
+                    raise ValueError(text)
+        for kind in reversed(type(self).__mro__):
+            for test, text in kind.__dict__.get("conflicts", ()):
+                if test(self):
+                    raise ValueError(text.format(self))
         return self
 
     def __setattr__(self, key: str, value: Any) -> None:
@@ -143,10 +150,15 @@ def is_finite_number(value: Any) -> bool:
     return abs(value) <= sys.float_info.max  # whole numbers may be too large to be converted
 
 
-def _no_path_of_its_own(name: str) -> str:
-    if name in (".", ".."):
-        raise ValueError('"." is not a valid name; results are stored under it')
-    return name
+def must(test: Callable[[Any], object], text: str) -> AfterValidator:
+    """Annotation of a key whose value must pass a test, with the message of one that does not."""
+
+    def check(value: Any) -> Any:
+        if not test(value):
+            raise ValueError(text)
+        return value
+
+    return AfterValidator(check)
 
 
 Finite = Annotated[float, Field(allow_inf_nan=False)]
@@ -156,20 +168,20 @@ PositiveInt = Annotated[int, Field(gt=0, lt=2**63)]
 NonNegativeInt = Annotated[int, Field(ge=0, lt=2**63)]
 Vector3 = Annotated[tuple[Finite, Finite, Finite], listed]
 PositiveInts3 = Annotated[tuple[PositiveInt, PositiveInt, PositiveInt], listed]
-Name = Annotated[str, Field(min_length=1, pattern=r"^[^/\x00-\x1f\x7f-\x9f]+$"), AfterValidator(_no_path_of_its_own)]
+Name = Annotated[
+    str,
+    Field(min_length=1, pattern=r"^[^/\x00-\x1f\x7f-\x9f]+$"),
+    must(lambda name: name not in (".", ".."), '"." is not a valid name; results are stored under it'),
+]
 """A name that is part of a path in the result file: not empty, no slash, and not a single dot, which HDF5 skips."""
 DIGEST = r"^[0-9a-f]{64}$"
 Digest = Annotated[str, Field(pattern=DIGEST)]
 """SHA-256 of the content of a file."""
 
 
-def _without_nul(name: str) -> str:
-    if "\0" in name:
-        raise ValueError("a name of a file cannot contain a NUL character")
-    return name
-
-
-FileName = Annotated[str, Field(min_length=1), AfterValidator(_without_nul)]
+FileName = Annotated[
+    str, Field(min_length=1), must(lambda name: "\0" not in name, "a name of a file cannot contain a NUL character")
+]
 """The name of a file, relative to the case file."""
 
 
@@ -294,18 +306,19 @@ class ConstraintKeys(StrictModel):
 class SurfaceKeys(StrictModel):
     """Keys of contacts that may rub and rebound."""
 
+    conflicts = (
+        (
+            lambda own: own.static_friction is not None and own.static_friction < own.friction,
+            "static_friction must be no less than friction = {0.friction!r}",
+        ),
+    )
+
     friction: NonNegativeFloat = 0.0
     """coefficient of Coulomb friction"""
     static_friction: NonNegativeFloat | None = None
     """coefficient of static friction; default, and minimum: friction"""
     restitution: Annotated[float, Field(ge=0.0, le=1.0)] = 0.0
     """coefficient of restitution: fraction of the normal velocity at which a node leaves after impact"""
-
-    @model_validator(mode="after")
-    def _rubs_more_at_rest(self) -> SurfaceKeys:
-        if self.static_friction is not None and self.static_friction < self.friction:
-            raise ValueError(f"static_friction must be no less than friction = {self.friction!r}")
-        return self
 
     @property
     def friction_coefficients(self) -> tuple[float, float]:

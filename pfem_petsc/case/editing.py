@@ -288,8 +288,7 @@ def changed_data(case: CaseModel, changes: Iterable[tuple[KeyPath, Any]]) -> dic
         value = plain(value)
         if path[-1:] == ("initial",) and isinstance(value, list):
             value = _initial(value)
-        parts = [str(part) for part in path]
-        put(data, parts, value, f"{case.source}: {key_text(path)}")
+        put(data, [str(part) for part in path], value, f"{case.source}: {key_text(path)}")
     return data
 
 
@@ -317,12 +316,10 @@ def merge(old: Any, new: Any) -> Any:
             old.__dict__[key] = merge(old.__dict__.get(key), value)
         object.__setattr__(old, "__pydantic_fields_set__", new.__pydantic_fields_set__)
         return old
-    if type(old) is dict:
-        return {name: merge(old.get(name), item) for name, item in new.items()}
-    if isinstance(old, Tables):
-        tables = {name: merge(old.get(name), table) for name, table in new.items()}
+    if isinstance(old, dict):
+        items = {name: merge(old.get(name), item) for name, item in new.items()}
         dict.clear(old)
-        dict.update(old, tables)
+        dict.update(old, items)
         return old
     if isinstance(old, Rows):
         if len(old) == len(new):

@@ -30,17 +30,16 @@ class Columns:
 
     Attributes
     ----------
-    names : of the columns, None where they have none
+    names : of the columns, None where they have none; named : those that there are
     count : number of columns
+    where : the line or row of a row, for messages
     """
-
-    names: list[str | None]
-    count: int
 
     def __init__(
         self, names: list[str | None], values: Callable[[int], np.ndarray], where: Callable[[int], str]
     ) -> None:
         self.names, self.count = names, len(names)
+        self.named = [name for name in names if name is not None]
         self._values, self.where = cache(values), where
 
     def find(self, column: str | int) -> int:
@@ -55,12 +54,12 @@ class Columns:
             if not 0 <= column < self.count:
                 raise InputError(f"column {column} does not exist: the file has the columns 0 to {self.count - 1}")
             return column
-        named = [name for name in self.names if name is not None]
-        if column not in named:
-            hint = nearest(column, named) if named else "; its columns have no names: give numbers, from 0"
+        number = self.named.count(column)
+        if number == 0:
+            hint = nearest(column, self.named) if self.named else "; its columns have no names: give numbers, from 0"
             raise InputError(f"there is no column {column!r}{hint}")
-        if named.count(column) > 1:
-            raise InputError(f"there are {named.count(column)} columns {column!r}; give numbers, from 0")
+        if number > 1:
+            raise InputError(f"there are {number} columns {column!r}; give numbers, from 0")
         return self.names.index(column)
 
     def values(self, column: str | int) -> np.ndarray:
@@ -168,14 +167,10 @@ def _text_columns(text: str) -> Columns:
     names = heading if len(heading) == len(rows[0]) else [None] * len(rows[0])
 
     def values(k: int) -> np.ndarray:
-        found = np.empty(len(rows))
-        for i, words in enumerate(rows):
-            try:
-                found[i] = float(words[k])
-            except ValueError as error:
-                shown = ", ".join(words)[:60]
-                raise InputError(f"line {numbers[i]}: expected numbers, got {words[k]!r} in {shown!r}") from error
-        return found
+        for i in [i for i, words in enumerate(rows) if not _is_number(words[k])][:1]:
+            shown = ", ".join(rows[i])[:60]
+            raise InputError(f"line {numbers[i]}: expected numbers, got {rows[i][k]!r} in {shown!r}")
+        return np.array([float(words[k]) for words in rows])
 
     return Columns(names, values, lambda row: f"line {numbers[row]}")
 
@@ -206,7 +201,14 @@ def rows_of(given: TableFile, file: Columns, names: tuple[str, ...]) -> list[lis
         Without file and key; the line or row is named.
     """
     found = _chosen(file, given.columns, names)
-    _check(file, found, names)
+    for k in np.flatnonzero(~np.isfinite(found).all(axis=0))[:1].tolist():
+        shown = ", ".join(f"{value:.6g}" for value in found[:, k])
+        raise InputError(
+            f"{file.where(k)}: expected {_COUNTS[len(names)]} finite numbers {', '.join(names)}, got {shown}"
+        )
+    _checked_times(found[0], file.where)
+    if not len(found[0]):
+        raise InputError("this file has no rows")
     times, values = given.time_scale * found[0] + given.time_offset, given.scale * found[1:] + given.offset
     return np.vstack([times, values]).T.tolist()
 
@@ -218,10 +220,11 @@ def _chosen(file: Columns, columns: tuple[str | int, ...] | None, names: tuple[s
     """Return the chosen columns (len(names), n)."""
     listed_names = ", ".join(names)
     if columns is None:
+        shown = f" ({', '.join(file.named)[:60]})" if file.named else ""
         if file.count != len(names):
             raise InputError(
                 f"{file.where(0)}: expected {_COUNTS[len(names)]} finite numbers {listed_names}, got {file.count} "
-                f"columns{_shown(file)}; choose columns by columns = [...]"
+                f"columns{shown}; choose columns by columns = [...]"
             )
         columns = tuple(range(file.count))
     if len(columns) != len(names):
@@ -233,23 +236,6 @@ def _chosen(file: Columns, columns: tuple[str | int, ...] | None, names: tuple[s
     if len({len(array) for array in given}) > 1:
         raise InputError(f"the columns {list(columns)} have {[len(array) for array in given]} rows")
     return np.array([np.zeros(len(given[0])) if array is None else array for array in found])
-
-
-def _shown(file: Columns) -> str:
-    names = [name for name in file.names if name is not None]
-    return f" ({', '.join(names)[:60]})" if names else ""
-
-
-def _check(file: Columns, found: np.ndarray, names: tuple[str, ...]) -> None:
-    bad = np.flatnonzero(~np.isfinite(found).all(axis=0))
-    if len(bad):
-        shown = ", ".join(f"{value:.6g}" for value in found[:, bad[0]])
-        raise InputError(
-            f"{file.where(int(bad[0]))}: expected {_COUNTS[len(names)]} finite numbers {', '.join(names)}, got {shown}"
-        )
-    _checked_times(found[0], file.where)
-    if not len(found[0]):
-        raise InputError("this file has no rows")
 
 
 _COMPONENT = re.compile(r"(.+)\.([xyz])")
@@ -352,9 +338,8 @@ def _from_arrays(arrays: dict[str, np.ndarray]) -> Forces:
     for name in ("force", "nodes"):
         if name not in arrays:
             raise InputError(f"there is no array {name!r}; the file has {', '.join(arrays)}")
-    unknown = [name for name in arrays if name not in ("time", "nodes", "force", "factor")]
-    if unknown:
-        raise InputError(f"there is an unknown array {unknown[0]!r}; expected time, nodes, force, factor")
+    for name in [name for name in arrays if name not in ("time", "nodes", "force", "factor")][:1]:
+        raise InputError(f"there is an unknown array {name!r}; expected time, nodes, force, factor")
     nodes = arrays["nodes"]
     if nodes.ndim != 1 or nodes.dtype.kind not in "iu" or not len(nodes):
         raise InputError("array 'nodes': expected node numbers (m,)")
@@ -380,9 +365,8 @@ def _array(arrays: dict[str, np.ndarray], name: str, shape: tuple[int, ...]) -> 
     array = np.asarray(arrays[name], dtype=np.float64)
     if array.shape != shape:
         raise InputError(f"array {name!r} has the shape {array.shape}: expected {shape}")
-    bad = np.argwhere(~np.isfinite(array))
-    if len(bad):
-        raise InputError(f"array {name!r}: entry {bad[0].tolist()} is not finite")
+    for entry in np.argwhere(~np.isfinite(array))[:1].tolist():
+        raise InputError(f"array {name!r}: entry {entry} is not finite")
     return array
 
 
@@ -397,20 +381,17 @@ def _from_text(path: Path) -> Forces:
                 f"column {k} has the heading {file.names[k] or ''!r}: expected NAME.x, NAME.y or NAME.z, with a node "
                 "set or a node number as NAME"
             )
-        member = targets.setdefault(_target(match[1]), len(targets))
-        found.append((k, member, "xyz".index(match[2])))
+        found.append((k, targets.setdefault(_target(match[1]), len(targets)), "xyz".index(match[2])))
     if not found:
         raise InputError("expected the time and columns NAME.x, NAME.y, NAME.z, with a heading")
     if len({each[1:] for each in found}) < len(found):
         raise InputError("two columns have the same heading")
     times = _checked_times(file.values(0), file.where)
     values = np.array([file.values(k) for k, _, _ in found]).T
-    bad = np.flatnonzero(~np.isfinite(values).all(axis=1))
-    if len(bad):
-        raise InputError(f"{file.where(int(bad[0]))}: expected finite numbers")
-    members = np.array([member for _, member, _ in found])
-    forces = np.eye(3)[[component for _, _, component in found]]
-    return Forces(times, list(targets), values, np.arange(len(found)), members, forces)
+    for row in np.flatnonzero(~np.isfinite(values).all(axis=1))[:1].tolist():
+        raise InputError(f"{file.where(row)}: expected finite numbers")
+    columns, members, components = np.arange(len(found)), *np.array(found).T[1:]
+    return Forces(times, list(targets), values, columns, members, np.eye(3)[components])
 
 
 def _target(name: str) -> int | str:
@@ -434,11 +415,9 @@ def _times(arrays: dict[str, np.ndarray]) -> np.ndarray:
 
 
 def _checked_times(times: np.ndarray, where: Callable[[int], str]) -> np.ndarray:
-    if not np.isfinite(times).all():
-        raise InputError(f"{where(int(np.flatnonzero(~np.isfinite(times))[0]))}: the time is not finite")
-    late = np.flatnonzero(np.diff(times) <= 0.0)
-    if len(late):
-        k = int(late[0])
+    for k in np.flatnonzero(~np.isfinite(times))[:1].tolist():
+        raise InputError(f"{where(k)}: the time is not finite")
+    for k in np.flatnonzero(np.diff(times) <= 0.0)[:1].tolist():
         raise InputError(
             f"{where(k + 1)}: times must increase, but {times[k + 1].item()!r} follows {times[k].item()!r}"
         )
@@ -465,25 +444,16 @@ def profile_of(path: Path, profile: str, keys: Sequence[str]) -> dict[str, float
     rows = [[cell.strip() for cell in row] for row in csv.reader(lines, delimiter=separator)]
     if not rows or "profile" not in rows[0]:
         raise InputError("expected a heading with the column profile, and columns named by keys of sections")
-    heading = rows[0]
-    for column in heading:
-        if column != "profile" and column not in keys:
-            raise InputError(f"column {column!r} is no key of a section{nearest(column, list(keys))}")
-    named = [row for row in rows[1:] if len(row) == len(heading) and row[heading.index("profile")] == profile]
-    uneven = next((row for row in rows[1:] if len(row) != len(heading)), None)
-    if uneven is not None:
-        raise InputError(f"the line {separator.join(uneven)!r} has {len(uneven)} cells, the heading {len(heading)}")
-    if len(named) != 1:
-        known = [row[heading.index("profile")] for row in rows[1:]]
-        hint = f"{len(named)} profiles are called {profile!r}" if named else f"no profile is called {profile!r}"
-        raise InputError(hint + ("" if named else nearest(profile, known)))
-    return {
-        key: _number_or_text(cell) for key, cell in zip(heading, named[0], strict=True) if cell and key != "profile"
-    }
-
-
-def _number_or_text(cell: str) -> float | str:
-    try:
-        return float(cell)
-    except ValueError:
-        return cell
+    heading, *profiles = rows
+    for column in [column for column in heading if column not in ("profile", *keys)][:1]:
+        raise InputError(f"column {column!r} is no key of a section{nearest(column, list(keys))}")
+    for row in [row for row in profiles if len(row) != len(heading)][:1]:
+        raise InputError(f"the line {separator.join(row)!r} has {len(row)} cells, the heading {len(heading)}")
+    named = [dict(zip(heading, row)) for row in profiles if row[heading.index("profile")] == profile]
+    if len(named) > 1:
+        raise InputError(f"{len(named)} profiles are called {profile!r}")
+    if not named:
+        known = [row[heading.index("profile")] for row in profiles]
+        raise InputError(f"no profile is called {profile!r}{nearest(profile, known)}")
+    values = {key: cell for key, cell in named[0].items() if cell and key != "profile"}
+    return {key: float(cell) if _is_number(cell) else cell for key, cell in values.items()}

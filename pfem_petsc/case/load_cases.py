@@ -8,7 +8,7 @@ nothing is superposed.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 from .base import has_rows
@@ -24,15 +24,13 @@ TABLES = ("load", "gravity", "wind", "temperature", "support")
 
 
 class UnsuitableError(ValueError):
-    """Load cases that cannot be combined: the key in the table, and why."""
-
-    def __init__(self, key: str, reason: str) -> None:
-        super().__init__(reason)
-        self.key = key
+    """Why load cases cannot be combined."""
 
 
-def stage_rows(cases: Sequence[Any], combinations: Sequence[Any], common: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """Return the tables of a stage for each load case and each combination.
+def stage_rows(
+    cases: Sequence[Any], combinations: Sequence[Any], common: Mapping[str, Any]
+) -> Iterator[dict[str, Any]]:
+    """Yield the tables of a stage for each load case and then for each combination.
 
     Parameters
     ----------
@@ -45,11 +43,11 @@ def stage_rows(cases: Sequence[Any], combinations: Sequence[Any], common: Mappin
         If a combination has no meaning, such as of two winds.
     """
     own = {case.name: _tables(case) for case in cases}
-    rows = [{"name": case.name, **_joined(common, {case.name: own[case.name]}, case.name)} for case in cases]
+    for case in cases:
+        yield {"name": case.name, **_joined(common, {case.name: own[case.name]})}
     for combination in combinations:
-        scaled = {n: _scaled(own[n], factor, combination.name) for n, factor in combination.factors.items() if factor}
-        rows.append({"name": combination.name, **_joined(common, scaled, combination.name)})
-    return rows
+        scaled = {name: _scaled(own[name], factor) for name, factor in combination.factors.items() if factor}
+        yield {"name": combination.name, **_joined(common, scaled)}
 
 
 def at_end(stage: Any) -> dict[str, Any]:
@@ -84,30 +82,32 @@ def _tables(case: Any) -> dict[str, Any]:
     return {key: value for key, value in {**lists, **single}.items() if value}
 
 
-def _scaled(tables: Mapping[str, Any], factor: float, name: str) -> dict[str, Any]:
+def _scaled(tables: Mapping[str, Any], factor: float) -> dict[str, Any]:
     """Return the tables of a load case times a factor."""
     made: dict[str, Any] = {}
     for key, value in tables.items():
         if key == "wind":  # its drag is proportional to the density
+            text = f"a wind cannot have the factor {factor:g} < 0: turn its velocity"
             if factor < 0.0:
-                raise UnsuitableError(name, f"a wind cannot have the factor {factor:g} < 0: turn its velocity")
+                raise UnsuitableError(text)
             made[key] = {**value, "density": factor * value["density"]}
         elif key == "gravity":
             made[key] = {**value, "acceleration": _times(value["acceleration"], factor)}
         else:
-            made[key] = [_scaled_row(key, row, factor, name) for row in value]
+            made[key] = [_scaled_row(key, row, factor) for row in value]
     return made
 
 
-def _scaled_row(key: str, row: Mapping[str, Any], factor: float, name: str) -> dict[str, Any]:
+def _scaled_row(key: str, row: Mapping[str, Any], factor: float) -> dict[str, Any]:
+    text = "a support with acceleration cannot be combined: give its motion"
+    if key == "support" and row.get("acceleration") is not None:
+        raise UnsuitableError(text)
     scaled = dict(row)
     for of in {"load": ("force",), "temperature": ("value", "table"), "support": ("motion", "velocity")}[key]:
         if row.get(of) is not None:
             scaled[of] = _times(row[of], factor)
     if key == "load" and "file" in row:
         scaled["scale"] = factor * row.get("scale", 1.0)
-    if key == "support" and row.get("acceleration") is not None:
-        raise UnsuitableError(name, "a support with acceleration cannot be combined: give its motion")
     return scaled
 
 
@@ -118,7 +118,7 @@ def _times(value: Any, factor: float) -> Any:
     return [factor * each for each in value] if isinstance(value, list | tuple) else factor * value
 
 
-def _joined(common: Mapping[str, Any], parts: Mapping[str, Mapping[str, Any]], name: str) -> dict[str, Any]:
+def _joined(common: Mapping[str, Any], parts: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
     """Return the tables of what is in force and of load cases, by their names, together."""
     made: dict[str, Any] = {}
     for key in TABLES:
@@ -128,42 +128,39 @@ def _joined(common: Mapping[str, Any], parts: Mapping[str, Mapping[str, Any]], n
         if key == "load":
             made[key] = [row for rows in (common.get(key, []), *given) for row in rows]
         elif key == "support":
-            made[key] = _supports(common.get(key, []), given, name)
+            made[key] = _supports(common.get(key, []), given)
         elif key == "gravity":
-            made[key] = _gravity([*([common[key]] if common.get(key) else []), *given], name)
+            made[key] = _gravity([*([common[key]] if common.get(key) else []), *given])
         elif len(given) > 1 or (key == "wind" and common.get(key)):
             of = [repr(each) for each, part in parts.items() if key in part]
             of += ["what acts in all load cases"] if common.get(key) else []
-            raise UnsuitableError(
-                name, f"adds the {key} of {' and '.join(of)}, of which one can act: leave out the others"
-            )
+            raise UnsuitableError(f"adds the {key} of {' and '.join(of)}, of which one can act: leave out the others")
         else:
             made[key] = given[0] if key == "wind" else [*common.get(key, []), *given[0]]
     return made
 
 
-def _gravity(tables: Sequence[Mapping[str, Any]], name: str) -> dict[str, Any]:
+def _gravity(tables: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     accelerations = [table["acceleration"] for table in tables]
+    text = "adds a gravity with rows to another gravity: give constant accelerations"
     if len(tables) > 1 and any(map(has_rows, accelerations)):
-        raise UnsuitableError(name, "adds a gravity with rows to another gravity: give constant accelerations")
+        raise UnsuitableError(text)
     if len(tables) == 1:
         return dict(tables[0])
     return {"acceleration": [sum(each) for each in zip(*accelerations, strict=True)]}
 
 
-def _supports(common: Sequence[Mapping[str, Any]], given: Sequence[Sequence[Any]], name: str) -> list[dict[str, Any]]:
+def _supports(common: Sequence[Mapping[str, Any]], given: Sequence[Sequence[Any]]) -> list[dict[str, Any]]:
     """Return the supports in force, with those of load cases in the place of those of the same name or node set."""
     rows = [dict(row) for row in common]
     taken: dict[str, dict[str, Any]] = {}
     for row in [row for each in given for row in each]:
         key = f"name {row['name']}" if row.get("name") else f"node set {row['node_set']}"
+        text = f"moves the support of {key} in two load cases: give one that moves it"
         if key in taken:
-            raise UnsuitableError(name, f"moves the support of {key} in two load cases: give one that moves it")
+            raise UnsuitableError(text)
         same = "name" if row.get("name") else "node_set"
-        found = next((k for k, other in enumerate(rows) if other.get(same) == row[same]), None)
+        found = next((k for k, other in enumerate(rows) if other.get(same) == row[same]), len(rows))
         taken[key] = dict(row)
-        if found is None:
-            rows.append(taken[key])
-        else:
-            rows[found] = taken[key]
+        rows[found : found + 1] = [taken[key]]
     return rows

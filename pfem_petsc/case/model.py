@@ -40,6 +40,7 @@ from .base import (
     PositiveInt,
     StrictModel,
     listed,
+    must,
     refers,
     refusal,
 )
@@ -69,7 +70,8 @@ class Reading:
 
     def rows(self, given: Any, columns: tuple[str, ...]) -> list[list[float]]:
         """Return the rows of a file: its name, or a table with the key ``file``."""
-        if not isinstance(given, str | Mapping) or given == "":
+        named = isinstance(given, str | Mapping) and given != ""
+        if not named:
             raise refusal(((), "expected the name of a file, or a table with the key file", given))
         read = TableFile.model_validate({"file": given} if isinstance(given, str) else given)
         try:
@@ -302,8 +304,9 @@ class Time(t.TimeKeys, WithParameters):
     def _known_step(self) -> Time:
         if self.step != "auto" or isinstance(self.scheme, UnknownParameters):
             return self
-        if not lookup(INTEGRATORS, self.integrator, "time.integrator").Scheme.explicit:
-            text = f'"auto" is for explicit schemes, and {self.integrator} is implicit: give the step in seconds'
+        text = f'"auto" is for explicit schemes, and {self.integrator} is implicit: give the step in seconds'
+        explicit = lookup(INTEGRATORS, self.integrator, "time.integrator").Scheme.explicit
+        if not explicit:
             raise refusal((("step",), text, "auto"))
         return self
 
@@ -350,13 +353,15 @@ class _Materials(Family):
         flaw = known.flaw(material, file) if file else ""
         if flaw:
             raise refusal((("law",), f"{file}: {flaw}", law))
-        if material.softening is not None and known.softening is None:
+        softens = material.softening is None or known.softening is not None
+        if not softens:
             raise refusal((("softening",), f"the law {law} does not soften by a table; remove the key", None))
         variables = [variable for variable, _ in material.choose(known).internal]
         for limit in ("plastic_strain", "damage"):
             value = getattr(material.rupture, limit, None)
-            if value is not None and not any(variable.endswith(limit) for variable in variables):
-                text = f"the law {law} has no {limit.replace('_', ' ')}; use another limit or law"
+            unknown = value is not None and not any(variable.endswith(limit) for variable in variables)
+            text = f"the law {law} has no {limit.replace('_', ' ')}; use another limit or law"
+            if unknown:
                 raise refusal((("rupture", limit), text, value))
         return material
 
@@ -387,14 +392,13 @@ class _Start(t.Initial):
 class _Initial(t.Initial):
     """The table [initial]."""
 
+    node_set: Annotated[
+        t.NodeSetName | None,
+        must(lambda name: name is None, "the velocity of a node set belongs under a heading [[initial.on]]"),
+    ] = None
+    """name of a node set"""
     on: list[_Start] = []
     """velocities of node sets, each under a heading ``[[initial.on]]``"""
-
-    @field_validator("node_set")
-    @classmethod
-    def _everywhere(cls, name: str | None) -> None:
-        if name is not None:
-            raise ValueError("the velocity of a node set belongs under a heading [[initial.on]]")
 
 
 class _Initials(Chosen):
@@ -437,6 +441,13 @@ Load = Annotated[
 class LoadCase(StrictModel):
     """Loads that act together, beside what the case has outside of load cases."""
 
+    conflicts = (
+        (
+            lambda own: not any(getattr(own, key) for key in load_cases.TABLES),
+            f"has no loads: expected at least one of the tables {', '.join(load_cases.TABLES)}",
+        ),
+    )
+
     name: Name
     """name of the load case in results, tables and messages; unique, also among combinations and stages"""
     load: Annotated[list[Load], listed] = []
@@ -451,10 +462,9 @@ class LoadCase(StrictModel):
     """supports that move, in the place of those of the same name or node set, under ``[[load_case.support]]``"""
 
     @model_validator(mode="after")
-    def _loads(self) -> LoadCase:
-        if not any(getattr(self, key) for key in load_cases.TABLES):
-            raise ValueError(f"has no loads: expected at least one of the tables {', '.join(load_cases.TABLES)}")
-        if self.wind is not None and self.wind.varies:
+    def _constant_wind(self) -> LoadCase:
+        varies = self.wind is not None and self.wind.varies
+        if varies:
             raise refusal((("wind", "velocity"), "a load case takes a constant wind [vx, vy, vz]", None))
         return self
 
@@ -511,13 +521,12 @@ class CaseModel(StrictModel):
         seen: dict[str | None, str] = {}
         for name, section in sections.items():
             group = None if section.bars is None else str(section.bars)
-            if group not in seen:
-                seen[group] = name
-            elif section.bars is None:
-                text = f"both this section and {seen[None]} name no bars; only one can be the default"
+            other, rest = seen.setdefault(group, name), group is None
+            text = f"both this section and {other} name no bars; only one can be the default"
+            if rest and other != name:
                 raise refusal(((name,), text, None))
-            else:
-                raise refusal(((name, "bars"), f"section {seen[group]} has these bars already", group))
+            if other != name:
+                raise refusal(((name, "bars"), f"section {other} has these bars already", group))
         return sections
 
     @field_validator("remove")
@@ -525,8 +534,9 @@ class CaseModel(StrictModel):
     def _removed_once(cls, entries: list[t.Remove]) -> list[t.Remove]:
         targets = [(entry.bars, entry.supports) for entry in entries]
         for i, (bars, supports) in enumerate(targets):
+            text = f"{str(bars or supports)!r} is removed by an earlier table already"
             if targets[i] in targets[:i]:
-                raise refusal(((i,), f"{str(bars or supports)!r} is removed by an earlier table already", None))
+                raise refusal(((i,), text, None))
         return entries
 
     @field_validator("contact")
@@ -549,9 +559,10 @@ class CaseModel(StrictModel):
         laws = internal_variables(info.data.get("material", {}))
         known = list(dict.fromkeys([*point_fields(), *cell_fields(), *laws]))
         for i, name in enumerate(output.fields or ()):
-            if name not in known and "material" in info.data:
+            unknown = name not in known and "material" in info.data
+            if unknown:
                 raise refusal((("fields", i), f"there is no field of this name{nearest(name, known)}", name))
-            if name in (output.fields or ())[:i]:
+            if name in output.fields[:i]:
                 raise refusal((("fields", i), "this field is listed twice", name))
         return output
 

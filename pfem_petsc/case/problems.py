@@ -112,8 +112,7 @@ class Problems:
         elif kind in ("value_error", "assertion_error"):
             self.add(where, str(context["error"]), None if isinstance(value, Mapping) else value)
         else:
-            tables = _tables_text(kind, owner)
-            self.add(where, tables or _expected(kind, value, context, field) + about, value)
+            self.add(where, _tables_text(kind, owner) or _expected(kind, value, context, field) + about, value)
 
 
 class Owner(NamedTuple):

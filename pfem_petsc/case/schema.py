@@ -267,16 +267,16 @@ class Case(_Tables):
         stages = stages_of(data, problems) if "stage" in data else []
         if not lenient:
             _add_plugins(data.get("plugins"), folder, problems)
-        reading = [Reading(tables, folder, lenient) for tables in (data, *(stage.data for stage in stages))]
-        model = _validated(data, reading[0], problems)
-        models = [
-            _validated(stage.data, each, problems, stage.place) for stage, each in zip(stages, reading[1:], strict=True)
-        ]
+        reading: list[Reading] = []
+
+        def validated(tables: Mapping[str, Any], place: Callable[[KeyPath], KeyPath] = tuple) -> Any:
+            reading.append(Reading(tables, folder, lenient))
+            return _validated(tables, reading[-1], problems, place)
+
+        model, models = validated(data), [validated(stage.data, stage.place) for stage in stages]
         if model is not None and None not in models and (model.load_case or model.combination):
             derived = load_case_stages(data, model, stages, [model, *models][-1], problems)
-            reading += (more := [Reading(stage.data, folder, lenient) for stage in derived])
-            pairs = zip(derived, more, strict=True)
-            models += [_validated(stage.data, each, problems, stage.place) for stage, each in pairs]
+            models += [validated(stage.data, stage.place) for stage in derived]
             stages += derived
         if model is not None and None not in models and not lenient:
             _check_sections(model, models, problems)
@@ -438,9 +438,9 @@ def _spread_damping(data: dict[str, Any], problems: Problems) -> None:
         if not isinstance(material, dict):
             continue
         for key in ("damping", "stiffness_damping"):
+            text = "[damping] gives each material its damping: remove this key, or that table"
             if material.get(key):
-                text = "[damping] gives each material its damping: remove this key, or that table"
-                problems.add(("material", name, key), text, material[key])
+                problems.add(("material", name, key), text, material.get(key))
         density = material.get("density")
         if is_finite_number(density):  # else it is refused
             material |= {"damping": of_mass * density, "stiffness_damping": of_stiffness}
@@ -473,24 +473,28 @@ def _check_sections(model: CaseModel, stages: list[CaseModel], problems: Problem
     wind = any(each.wind is not None for each in (model, *stages))
     for name, section in model.section.items():
         for key in ("drag_coefficient",) if section.shape is not None else ("diameter", "drag_coefficient"):
-            if getattr(section, key) is not None and not wind:
-                text = "has an effect in wind alone: remove the key, or give [wind]"
-                problems.add(("section", name, key), text, getattr(section, key))
+            text, value = "has an effect in wind alone: remove the key, or give [wind]", getattr(section, key)
+            if value is not None and not wind:
+                problems.add(("section", name, key), text, value)
         material = model.material.get(section.material)
         if material is None or law_of(material).bar_data:  # whose law may use the shape
             continue
         warned = not material.describes_buckling and (section.shape is not None or section.second_moment is not None)
         if section.effective_length != 1.0 and not warned:
-            text = "has no effect: bars of this material and section are not checked for buckling; remove the key"
-            problems.add(("section", name, "effective_length"), text, section.effective_length)
+            problems.add(
+                ("section", name, "effective_length"),
+                "has no effect: bars of this material and section are not checked for buckling; remove the key",
+                section.effective_length,
+            )
         path = ("section", name, "thickness")
         follows = section.area is None and section.area_field is None  # from the sizes
         if path in problems.overridden and not follows and not wind:
-            text = (
+            problems.add(
+                path,
                 "changes no result: stiffness and mass follow from area, and the law does not buckle; change area, or "
-                "give diameter instead of it"
+                "give diameter instead of it",
+                section.thickness,
             )
-            problems.add(path, text, section.thickness)
 
 
 def _add_plugins(given: Any, folder: Path, problems: Problems) -> None:
@@ -558,14 +562,14 @@ class StageTables(NamedTuple):
 def stages_of(data: Mapping[str, Any], problems: Problems) -> list[StageTables]:
     """The stages of a case's nested tables; rejected ones are reported in ``problems`` and left out."""
     rows = data["stage"]
+    text = "expected a list of at least one table, each under a heading [[stage]]"
     if not isinstance(rows, list) or not rows:
-        problems.add(("stage",), "expected a list of at least one table, each under a heading [[stage]]", rows)
+        problems.add(("stage",), text, rows)
         return []
-    for key in ANALYSES:
-        if key in data:
-            having = [f"stage[{k}].{key}" for k, row in enumerate(rows) if isinstance(row, Mapping) and key in row]
-            there = f"; this case has {', '.join(having)}" if having else ""
-            problems.add((), f"[{key}] and [[stage]] exclude each other: give [stage.{key}]{there}")
+    for key in [key for key in ANALYSES if key in data]:
+        having = [f"stage[{k}].{key}" for k, row in enumerate(rows) if isinstance(row, Mapping) and key in row]
+        there = f"; this case has {', '.join(having)}" if having else ""
+        problems.add((), f"[{key}] and [[stage]] exclude each other: give [stage.{key}]{there}")
     last = len(rows) - 1
     not_common = ("stage", "load_case", "combination", "modes", *ANALYSES)
     common = {key: value for key, value in data.items() if key not in not_common}
@@ -575,8 +579,10 @@ def stages_of(data: Mapping[str, Any], problems: Problems) -> list[StageTables]:
         if not isinstance(row, Mapping):
             problems.add(("stage", k), "expected a table", row)
             continue
-        name = _stage_name(row, k, problems)
-        if name in [stage.name for stage in found]:
+        name, taken = row.get("name", f"stage{k + 1}"), [stage.name for stage in found]
+        read = problems.validated(StageName, {"name": name}, None, lambda path, k=k: ("stage", k, *path))
+        name = read.name if read is not None else f"stage{k + 1}"
+        if name in taken:
             problems.add(("stage", k, "name"), "another stage has this name", name)
         known = ["name", *ANALYSES, *STAGE_TABLES]
         for key in [key for key in row if key not in known]:
@@ -593,9 +599,9 @@ def stages_of(data: Mapping[str, Any], problems: Problems) -> list[StageTables]:
         owner |= dict.fromkeys((*given, *ANALYSES), k)
         owner.pop("output", None)
         chosen = [key for key in ANALYSES if key in row]
+        text = f"expected one of the tables [stage.time], [stage.static]; {'not both' if chosen else 'it has none'}"
         if len(chosen) != 1:
-            got = "not both" if chosen else "it has none"
-            problems.add(("stage", k), f"expected one of the tables [stage.time], [stage.static]; {got}")
+            problems.add(("stage", k), text)
             continue
         here = {**common, chosen[0]: row[chosen[0]]}
         if k == last and "modes" in data:
@@ -605,15 +611,10 @@ def stages_of(data: Mapping[str, Any], problems: Problems) -> list[StageTables]:
     return found
 
 
-def _stage_name(row: Mapping[str, Any], k: int, problems: Problems) -> str:
-    name = row.get("name", f"stage{k + 1}")
-    read = problems.validated(StageName, {"name": name}, None, lambda path: ("stage", k, *path))
-    return read.name if read is not None else f"stage{k + 1}"
-
-
 def _sections(given: Any, common: Any, k: int, problems: Problems) -> Any:
     """The sections of a stage: those of the case, with the prestress that it gives."""
-    if not isinstance(given, Mapping) or not isinstance(common, Mapping):
+    tables = isinstance(given, Mapping) and isinstance(common, Mapping)
+    if not tables:
         problems.add(("stage", k, "section"), "expected tables by the names of sections", given)
         return common
     merged = dict(common)
@@ -645,46 +646,51 @@ def load_case_stages(
 
     ``start`` is the validated last stage, or the case without stages."""
     made: list[StageTables] = []
+    text = "modes are those of one state, and not of load cases: give a case without them"
     if model.modes is not None:
-        problems.add(("modes",), "modes are those of one state, and not of load cases: give a case without them")
+        problems.add(("modes",), text)
         return []
     if not stages:
+        text = "[[load_case]] needs [static], by which each of them is solved, or static stages before"
         if model.static is None:
-            problems.add((), "[[load_case]] needs [static], by which each of them is solved, or static stages before")
+            problems.add((), text)
             return []
         common = {key: value for key, value in data.items() if key not in ("load_case", "combination", "modes")}
         made.append(StageTables(load_cases.PERMANENT, common, (), (), {}, of=()))
     last = [*stages, *made][-1]
+    text = f"load cases start from a static state, and the last stage {last.name!r} is none"
     if "static" not in last.data:
-        problems.add((), f"load cases start from a static state, and the last stage {last.name!r} is none")
+        problems.add((), text)
         return []
     static = last.data["static"] if isinstance(last.data["static"], Mapping) else {}
     method = static.get("method", "newton")
     if method == "force_density":  # the net as built
         static, method = {"method": "newton"}, "newton"
+    known = ", ".join(load_cases.METHODS)
+    text = f"load cases are solved by the method of the state before them, one of {known}; got {method}"
     if method not in load_cases.METHODS:
-        known = ", ".join(load_cases.METHODS)
-        problems.add((), f"load cases are solved by the method of the state before them, one of {known}; got {method}")
+        problems.add((), text)
         return []
     names = [stage.name for stage in (*stages, *made)]
     keys = [("load_case", k) for k in range(len(model.load_case))]
     keys += [("combination", k) for k in range(len(model.combination))]
     common = {key: value for key, value in last.data.items() if key not in ("modes", *ONE_STAGE)} | {"static": static}
+    rows: list[dict[str, Any]] = []
     try:
-        rows = load_cases.stage_rows(model.load_case, model.combination, load_cases.at_end(start))
+        for row in load_cases.stage_rows(model.load_case, model.combination, load_cases.at_end(start)):
+            rows.append(row)  # one by one: which one cannot be made?
     except load_cases.UnsuitableError as error:
-        named = [row.name for row in (*model.load_case, *model.combination)]
-        problems.add(keys[named.index(error.key)], f"{error.key!r} {error}")
+        wrong = [*model.load_case, *model.combination][len(rows)]
+        problems.add(keys[len(rows)], f"{wrong.name!r} {error}")
         return []
     base = len(stages) + len(made) - 1
     for of, row in zip(keys, rows, strict=True):
         name = row.pop("name")
+        before = not stages and name == load_cases.PERMANENT
+        text = "the state before the load cases has this name: give another"
+        text = text if before else "another load case, combination or stage has it"
         if name in names:
-            own = "the state before the load cases has this name: give another"
-            taken = (
-                own if not stages and name == load_cases.PERMANENT else "another load case, combination or stage has it"
-            )
-            problems.add((*of, "name"), taken, name)
+            problems.add((*of, "name"), text, name)
         names.append(name)
         made.append(StageTables(name, {**common, **row}, tuple(row), (), {}, of=of, starts_from=base))
     return made

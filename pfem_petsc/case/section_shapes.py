@@ -33,30 +33,36 @@ class Shape(NamedTuple):
     inner: Callable[[float, float], tuple[float, float]]
 
 
-def _box(b: float, h: float, t: float, _: float) -> Outline:
-    outer = [(0.0, 0.0), (b, 0.0), (b, h), (0.0, h)]
-    return [outer, [(t, t), (t, h - t), (b - t, h - t), (b - t, t)]]
-
-
-def _angle(b: float, h: float, t: float, _: float) -> Outline:
-    return [[(0.0, 0.0), (b, 0.0), (b, t), (t, t), (t, h), (0.0, h)]]
-
-
-def _i_section(b: float, h: float, t: float, w: float) -> Outline:
-    left, right = 0.5 * (b - w), 0.5 * (b + w)
-    bottom = [(left, t), (0.0, t), (0.0, 0.0), (b, 0.0), (b, t), (right, t)]
-    return [[*bottom, (right, h - t), (b, h - t), (b, h), (0.0, h), (0.0, h - t), (left, h - t)]]
-
-
-def _channel(b: float, h: float, t: float, w: float) -> Outline:
-    return [[(0.0, 0.0), (b, 0.0), (b, t), (w, t), (w, h - t), (b, h - t), (b, h), (0.0, h)]]
-
-
 POLYGONS: dict[str, Shape] = {
-    "angle": Shape(_angle, False, lambda b, h: (min(b, h), math.inf)),
-    "box": Shape(_box, False, lambda b, h: (0.5 * min(b, h), math.inf)),
-    "I": Shape(_i_section, True, lambda b, h: (0.5 * h, b)),
-    "channel": Shape(_channel, True, lambda b, h: (0.5 * h, b)),
+    "angle": Shape(
+        lambda b, h, t, _: [[(0.0, 0.0), (b, 0.0), (b, t), (t, t), (t, h), (0.0, h)]],
+        False,
+        lambda b, h: (min(b, h), math.inf),
+    ),
+    "box": Shape(
+        lambda b, h, t, _: [
+            [(0.0, 0.0), (b, 0.0), (b, h), (0.0, h)],
+            [(t, t), (t, h - t), (b - t, h - t), (b - t, t)],
+        ],
+        False,
+        lambda b, h: (0.5 * min(b, h), math.inf),
+    ),
+    # with the origin in the middle of the web
+    "I": Shape(
+        lambda b, h, t, w: [
+            [(-w / 2, t), (-b / 2, t), (-b / 2, 0.0), (b / 2, 0.0), (b / 2, t), (w / 2, t)]
+            + [(w / 2, h - t), (b / 2, h - t), (b / 2, h), (-b / 2, h), (-b / 2, h - t), (-w / 2, h - t)]
+        ],
+        True,
+        lambda b, h: (0.5 * h, b),
+    ),
+    "channel": Shape(
+        lambda b, h, t, w: [
+            [(0.0, 0.0), (b, 0.0), (b, t), (w, t), (w, h - t), (b, h - t), (b, h), (0.0, h)],
+        ],
+        True,
+        lambda b, h: (0.5 * h, b),
+    ),
 }
 """Shapes by name. A new one is an outline and a line here."""
 
@@ -110,9 +116,8 @@ def cross_section(
         return _without_shape(sizes, area, second_moment)
     allowed = {"round": ("diameter",), "tube": ("diameter", "thickness")}.get(shape, ("width", "height", "thickness"))
     allowed += ("web_thickness",) if shape in POLYGONS and POLYGONS[shape].webs else ()
-    foreign = [size for size in sizes if size not in allowed]
-    if foreign:
-        raise ValueError(f'{foreign[0]} is no size of shape = "{shape}", which has {", ".join(allowed)}')
+    for size in [size for size in sizes if size not in allowed][:1]:
+        raise ValueError(f'{size} is no size of shape = "{shape}", which has {", ".join(allowed)}')
     if shape in CIRCLES:
         return _circle(shape, sizes, area)
     return _polygon(shape, sizes, area)
@@ -121,9 +126,8 @@ def cross_section(
 def _without_shape(
     sizes: Mapping[str, float], area: np.ndarray | float | None, second_moment: float | None
 ) -> CrossSection:
-    foreign = [size for size in sizes if size != "diameter"]
-    if foreign:
-        raise ValueError(f"{foreign[0]} needs a shape: {', '.join(SHAPES)}")
+    for size in [size for size in sizes if size != "diameter"][:1]:
+        raise ValueError(f"{size} needs a shape: {', '.join(SHAPES)}")
     if area is None:
         raise ValueError("expected area, area_field, or a shape with its sizes")
     radius, moment, modulus = np.sqrt(area / np.pi), 0.0 * area, 0.0 * area

@@ -22,6 +22,7 @@ from ..errors import InputError
 from .base import (
     Digest,
     FileName,
+    FilePath,
     Finite,
     Name,
     NodeSetName,
@@ -40,6 +41,7 @@ from .base import (
     has_rows,
     is_finite_number,
     listed,
+    must,
     refers,
     refusal,
 )
@@ -68,29 +70,30 @@ FIELD_KEYS = ("area_field", *(f"{key}_field" for key in BY_BAR))
 """Keys of a section that name fields of the mesh with a value for each bar."""
 
 
-def _has_direction(value: tuple[float, float, float]) -> tuple[float, float, float]:
-    if not any(value):
-        raise ValueError("has zero length; give a direction")
-    if not 1e-100 < max(map(abs, value)) < 1e100:
-        raise ValueError("has components out of range (1e-100 to 1e100); give a vector of about length 1")
-    return value
-
-
 _PARALLEL = 1e-6  # sine of the angle between two vectors that give no frame
 
-Direction = Annotated[Vector3, AfterValidator(_has_direction)]
+Direction = Annotated[
+    Vector3,
+    must(any, "has zero length; give a direction"),
+    must(
+        lambda vector: 1e-100 < max(map(abs, vector)) < 1e100,
+        "has components out of range (1e-100 to 1e100); give a vector of about length 1",
+    ),
+]
 """A vector of any length, which gives a direction."""
 
 
-def check_frame(frame: tuple[tuple[float, float, float], tuple[float, float, float]]) -> None:
-    """Refuse two vectors that give no frame."""
-    first, second = (np.array(row) / np.linalg.norm(row) for row in frame)
-    if np.linalg.norm(np.cross(first, second)) < _PARALLEL:
-        raise ValueError("the two vectors of frame are parallel; the second must point to the side of the y axis")
+def _parallel(table: Any) -> bool:
+    """Whether the two vectors of the key ``frame`` give none."""
+    first, second = (np.array(row) / np.linalg.norm(row) for row in table.frame)
+    return np.linalg.norm(np.cross(first, second)) < _PARALLEL
 
 
-def _path_of(name: str, info: ValidationInfo) -> Path:
-    return Path(name) if info.context is None else Path(info.context.folder, name).resolve()
+NO_FRAME = (
+    lambda own: own.frame is not None and _parallel(own),
+    "the two vectors of frame are parallel; the second must point to the side of the y axis",
+)
+"""One of the conflicts of tables with the key ``frame``."""
 
 
 class MeshKeys(StrictModel):
@@ -98,7 +101,7 @@ class MeshKeys(StrictModel):
 
     generator: Name | None = None
     """name of a mesh generator"""
-    file: Annotated[FileName, AfterValidator(_path_of), PlainSerializer(str)] | None = None
+    file: Annotated[FilePath, AfterValidator(lambda name: Path(name)), PlainSerializer(str)] | None = None
     """mesh file, relative to the case file"""
 
     @model_validator(mode="after")
@@ -140,15 +143,8 @@ BarGroup = Annotated[
 def numbers_of(what: str) -> Any:
     """Type of a key with numbers of nodes or bars, a ``what``, of which there is at least one, and none is listed
     twice."""
-
-    def check(numbers: tuple[int, ...]) -> tuple[int, ...]:
-        if not numbers:
-            raise ValueError(f"expected at least one {what} number")
-        if len(set(numbers)) < len(numbers):
-            raise ValueError(f"a {what} number is listed twice")
-        return numbers
-
-    return Annotated[tuple[NonNegativeInt, ...], listed, AfterValidator(check)]
+    once = must(lambda numbers: len(set(numbers)) == len(numbers), f"a {what} number is listed twice")
+    return Annotated[tuple[NonNegativeInt, ...], listed, must(len, f"expected at least one {what} number"), once]
 
 
 NodeNumbers, BarNumbers = numbers_of("node"), numbers_of("bar")
@@ -158,6 +154,12 @@ class NodeSet(StrictModel):
     """A named set of nodes, selected by exactly one key; ``field`` goes with ``value``."""
 
     exactly_one = (("nearest", "box", "group", "indices", "field", "all"),)
+    conflicts = (
+        (
+            lambda own: (own.field is None) != (own.value is None),
+            'field and value need each other: field = "NAME", value = 2',
+        ),
+    )
 
     nearest: Vector3 | None = None
     """a point [m]: selects the nearest node"""
@@ -177,17 +179,10 @@ class NodeSet(StrictModel):
     @field_validator("box")
     @classmethod
     def _ordered(cls, box: tuple[Vector3, Vector3] | None) -> tuple[Vector3, Vector3] | None:
-        if box is not None:
-            for axis, low, high in zip("xyz", *box, strict=True):
-                if low > high:
-                    raise ValueError(f"the first corner must be the lower one, but {axis} is {low!r} and then {high!r}")
+        for axis, low, high in zip("xyz", *box, strict=True) if box is not None else ():
+            if low > high:
+                raise ValueError(f"the first corner must be the lower one, but {axis} is {low!r} and then {high!r}")
         return box
-
-    @model_validator(mode="after")
-    def _field_with_value(self) -> NodeSet:
-        if (self.field is None) != (self.value is None):
-            raise ValueError('field and value need each other: field = "NAME", value = 2')
-        return self
 
     @property
     def selection(self) -> FieldValue | None:
@@ -197,6 +192,14 @@ class NodeSet(StrictModel):
 
 class Rupture(StrictModel):
     """A bar breaks at the end of the step in which it first reaches one of the limits."""
+
+    conflicts = (
+        (
+            lambda own: all(value is None for key, value in own if key != "steps"),
+            "expected at least one limit: stress, strain, compressive_stress, compressive_strain, plastic_strain, "
+            "damage",
+        ),
+    )
 
     stress: PositiveFloat | None = None
     """tensile stress [Pa]"""
@@ -212,13 +215,6 @@ class Rupture(StrictModel):
     """damage variable of the law"""
     steps: PositiveInt = 1
     """steps over which the force of a broken bar is reduced to zero in equal parts"""
-
-    @model_validator(mode="after")
-    def _at_least_one(self) -> Rupture:
-        limits = [key for key in type(self).model_fields if key != "steps"]
-        if all(getattr(self, key) is None for key in limits):
-            raise ValueError(f"expected at least one limit: {', '.join(limits)}")
-        return self
 
 
 class Section(StrictModel):
@@ -263,7 +259,16 @@ class Section(StrictModel):
     """axial force in the mesh [N], or rows [t, force] [s, N]: linear between rows, constant outside"""
     prestress: NumberOrRows | None = None
     """stress in the mesh [Pa], or rows [t, stress] [s, Pa]"""
-    rest_length: NumberOrRows | None = None
+    rest_length: (
+        Annotated[
+            NumberOrRows,
+            must(
+                lambda value: all(1e-3 < row[1] < 1e3 for row in (value if has_rows(value) else [[0.0, value]])),
+                "expected a factor on the length in the mesh, like 0.99, or rows [t, factor]",
+            ),
+        ]
+        | None
+    ) = None
     """rest length over the length in the mesh, or rows [t, factor] [s, -]; if constant, mass is that of this length"""
     force_density: NumberOrRows | None = None
     """axial force over length in the mesh [N/m], or rows [t, q] [s, N/m]"""
@@ -297,14 +302,6 @@ class Section(StrictModel):
             text = f"the profile {data['profile']!r} has this value too: remove it here, or from the catalogue"
             raise refusal(((taken[0],), text, data[taken[0]]))
         return {key: value for key, value in data.items() if key not in ("catalogue", "profile")} | values
-
-    @field_validator("rest_length")
-    @classmethod
-    def _factor(cls, value: Any) -> Any:
-        rows = value if has_rows(value) else [[0.0, value]] if value is not None else []
-        if not all(1e-3 < row[1] < 1e3 for row in rows):
-            raise ValueError("expected a factor on the length in the mesh, like 0.99, or rows [t, factor]")
-        return value
 
     @property
     def prestressed(self) -> str | None:
@@ -342,6 +339,13 @@ class Section(StrictModel):
 class Initial(StrictModel):
     """Initial velocity v + w x (X - c) of a node set, or of all nodes if ``node_set`` is None."""
 
+    conflicts = (
+        (
+            lambda own: own.centre is not None and not any(own.angular_velocity),
+            "centre needs an angular_velocity [rad/s] other than zero",
+        ),
+    )
+
     node_set: NodeSetName | None = None
     """name of a node set"""
     velocity: Vector3 = (0.0, 0.0, 0.0)
@@ -351,31 +355,42 @@ class Initial(StrictModel):
     centre: Vector3 | None = None
     """centre c of the rotation [m]; default: the centre of mass"""
 
-    @model_validator(mode="after")
-    def _centre_turns(self) -> Initial:
-        if self.centre is not None and not any(self.angular_velocity):
-            raise ValueError("centre needs an angular_velocity [rad/s] other than zero")
-        return self
-
-
-def _moves_along(normal: tuple, given: np.ndarray) -> None:
-    """Refuse vectors of a motion (n, 3) that are all across the one direction in which a support prescribes it."""
-    unit = np.array(normal) / np.linalg.norm(normal)
-    if given.any() and np.abs(given @ unit).max() <= _PARALLEL * np.abs(given).max():
-        raise ValueError("the motion has no component along normal, so it would have no effect")
-
 
 class Support(WithFiles):
     """Fixed or prescribed position components of a node set."""
 
     exactly_one = (("fix", "normal"),)
     at_most_one = (("motion", "velocity", "acceleration"),)
+    conflicts = (
+        (
+            lambda own: own.interpolation == "linear" and own.motion is None,
+            'interpolation = "linear" requires motion; accelerations are always linear between rows',
+        ),
+        (
+            lambda own: own.frame is not None and own.fix is None,
+            "frame defines the axes of fix; expected the key fix",
+        ),
+        NO_FRAME,
+        (
+            lambda own: own.normal is not None and own._moves_across,
+            "the motion has no component along normal, so it would have no effect",
+        ),
+    )
 
     name: Name | None = None
     """name, by which [[remove]] refers to the support; unique"""
     node_set: NodeSetName
     """name of a node set"""
-    fix: str | None = None
+    fix: (
+        Annotated[
+            str,
+            must(
+                lambda fix: fix and set(fix) <= set("xyz") and len(set(fix)) == len(fix),
+                'expected any of the components x, y, z, each once, like "xz"',
+            ),
+        ]
+        | None
+    ) = None
     """the fixed components: any of x, y, z"""
     frame: Annotated[tuple[Direction, Direction], listed] | None = None
     """axes of ``fix`` that are not those of the model: x along the first vector, y in the plane of both, on the side of
@@ -399,31 +414,19 @@ class Support(WithFiles):
     interpolation: Literal["smooth", "linear"] = "smooth"
     """interpolation of ``motion`` between its rows: a cubic spline, or straight lines with velocity jumps at rows"""
 
-    @field_validator("fix")
-    @classmethod
-    def _components(cls, fix: str | None) -> str | None:
-        if fix is None:
-            return None
-        if not fix or set(fix) - set("xyz") or len(set(fix)) < len(fix):
-            raise ValueError('expected any of the components x, y, z, each once, like "xz"')
-        return fix
-
     @model_validator(mode="after")
     def _moves_what_it_fixes(self) -> Support:
-        if self.interpolation == "linear" and self.motion is None:
-            raise ValueError('interpolation = "linear" requires motion; accelerations are always linear between rows')
-        if self.frame is not None:
-            if self.fix is None:
-                raise ValueError("frame defines the axes of fix; expected the key fix")
-            check_frame(self.frame)
-        if self.normal is not None:
-            _moves_along(self.normal, self._vectors)
-        if self.fix is None or self.frame is not None:
-            return self
-        for axis, moves in zip("xyz", self._vectors.any(axis=0), strict=True):
-            if moves and axis not in self.fix:
+        for axis, moves in zip("xyz", self._vectors.any(axis=0)) if self.fix and self.frame is None else ():
+            free = moves and axis not in self.fix
+            if free:
                 raise ValueError(f'{axis} is given a motion, but fix = "{self.fix}" leaves it free')
         return self
+
+    @property
+    def _moves_across(self) -> bool:
+        """Whether all vectors of its motion are across the one direction in which it prescribes them."""
+        unit, given = np.array(self.normal) / np.linalg.norm(self.normal), self._vectors
+        return given.any() and np.abs(given @ unit).max() <= _PARALLEL * np.abs(given).max()
 
     @property
     def _vectors(self) -> np.ndarray:
@@ -474,6 +477,14 @@ class _GroundOrNodes(StrictModel):
 class Spring(_GroundOrNodes):
     """Spring without force at the positions in the mesh."""
 
+    conflicts = (
+        (
+            lambda own: own.frame is not None and own.between is not None,
+            "frame defines the axes of springs to the ground; springs between nodes act along their line",
+        ),
+        NO_FRAME,
+    )
+
     stiffness: Any
     """stiffness [kx, ky, kz] of each node of the set along the axes, or k along the line between two nodes [N/m]"""
     frame: Annotated[tuple[Direction, Direction], listed] | None = None
@@ -483,24 +494,16 @@ class Spring(_GroundOrNodes):
     @classmethod
     def _as_many_as_directions(cls, value: Any, info: ValidationInfo) -> Any:
         if info.data.get("between") is not None:
-            if not is_finite_number(value) or not value > 0.0:
-                raise ValueError("expected one number > 0 [N/m] between nodes, along the line from one to the other")
+            along = "expected one number > 0 [N/m] between nodes, along the line from one to the other"
+            if not (is_finite_number(value) and value > 0.0):
+                raise ValueError(along)
             return float(value)
-        if not isinstance(value, list | tuple) or len(value) != 3 or not all(map(is_finite_number, value)):
+        three = isinstance(value, list | tuple) and len(value) == 3 and all(map(is_finite_number, value))
+        if not three:
             raise ValueError("expected three numbers [kx, ky, kz] [N/m] to the ground")
         if min(value) < 0.0:
             raise ValueError("expected values >= 0")
         return tuple(map(float, value))
-
-    @model_validator(mode="after")
-    def _frame_of_three_values(self) -> Spring:
-        if self.frame is not None:
-            if self.between is not None:
-                raise ValueError(
-                    "frame defines the axes of springs to the ground; springs between nodes act along their line"
-                )
-            check_frame(self.frame)
-        return self
 
 
 class Dashpot(_GroundOrNodes):
@@ -520,6 +523,13 @@ class Dashpot(_GroundOrNodes):
 class _Interpolated(WithFiles):
     """What may vary over time, by rows."""
 
+    conflicts = (
+        (
+            lambda own: own.interpolation == "smooth" and not own.varies,
+            'interpolation = "smooth" requires rows over time',
+        ),
+    )
+
     interpolation: Literal["linear", "smooth"] = "linear"
     """interpolation between the rows: straight lines, or a cubic spline"""
 
@@ -527,12 +537,6 @@ class _Interpolated(WithFiles):
     def varies(self) -> bool:
         """Whether there are rows over time."""
         return any(has_rows(value) for value in self.__dict__.values())
-
-    @model_validator(mode="after")
-    def _interpolates(self) -> _Interpolated:
-        if self.interpolation == "smooth" and not self.varies:
-            raise ValueError('interpolation = "smooth" requires rows over time')
-        return self
 
 
 class Load(_Interpolated):
@@ -694,11 +698,10 @@ class ContactSettings(StrictModel):
     """treatment of impact: velocity and acceleration of nodes in contact"""
 
 
-def _computable(seconds: float) -> float:
-    """Refuse times whose powers in the formulas of the schemes overflow double precision."""
-    if not 1e-50 <= seconds <= 1e50:
-        raise ValueError("overflows double precision in the formulas of the schemes; give seconds from 1e-50 to 1e50")
-    return seconds
+_computable = must(
+    lambda seconds: 1e-50 <= seconds <= 1e50,
+    "overflows double precision in the formulas of the schemes; give seconds from 1e-50 to 1e50",
+)
 
 
 class TimeKeys(StrictModel):
@@ -708,32 +711,30 @@ class TimeKeys(StrictModel):
     """name of a time integration scheme"""
     step: Any
     """time step [s], or "auto" with an explicit scheme"""
-    end: Annotated[PositiveFloat, AfterValidator(_computable)]
+    end: Annotated[PositiveFloat, _computable]
     """end time [s]"""
     mass: Literal["lumped", "consistent"] = "lumped"
     """mass matrix"""
     safety: Annotated[float, Field(gt=0.0, le=1.0)] = 0.9
     """factor on the critical step if step = "auto\""""
-    damping_table: Table2 | None = None
+    damping_table: (
+        Annotated[Table2, must(lambda rows: all(row[1] >= 0.0 for row in rows), "expected factors >= 0")] | None
+    ) = None
     """rows [t, factor] [s, -] of the damping of all materials over time, constant outside; default: factor 1"""
-
-    @field_validator("damping_table")
-    @classmethod
-    def _factors(cls, table: tuple[Any, ...] | None) -> tuple[Any, ...] | None:
-        if any(row[1] < 0.0 for row in table or ()):
-            raise ValueError("expected factors >= 0")
-        return table
 
     @field_validator("step")
     @classmethod
     def _step(cls, step: Any) -> float | str:
         if step == "auto":
             return "auto"
-        if isinstance(step, bool) or not isinstance(step, int | float):
-            raise ValueError('expected a number of seconds in SI units without quotes and unit, or "auto"')
-        if not (step > 0 and is_finite_number(step)):
+        number = isinstance(step, int | float) and not isinstance(step, bool)
+        text = 'expected a number of seconds in SI units without quotes and unit, or "auto"'
+        if not number:
+            raise ValueError(text)
+        positive = step > 0 and is_finite_number(step)
+        if not positive:
             raise ValueError('expected a finite number of seconds > 0, or "auto"')
-        return _computable(float(step))
+        return _computable.func(float(step))
 
 
 class StaticKeys(StrictModel):
@@ -746,6 +747,8 @@ class StaticKeys(StrictModel):
 class Modes(StrictModel):
     """Modes of the state at the end of the analysis, or of the initial state where the case has none."""
 
+    conflicts = ((lambda own: own.linear and own.kind != "buckling", 'linear = true is of kind = "buckling"'),)
+
     count: PositiveInt = 10
     """number of modes"""
     kind: Literal["vibration", "buckling"] = "vibration"
@@ -757,12 +760,6 @@ class Modes(StrictModel):
     analysis to its end, or for all loads without one"""
     solver: Literal["auto", "dense", "scipy", "slepc"] = "auto"
     """library that solves the eigenvalue problem"""
-
-    @model_validator(mode="after")
-    def _linear_buckling(self) -> Modes:
-        if self.linear and self.kind != "buckling":
-            raise InputError('linear = true is of kind = "buckling"')
-        return self
 
 
 class Probe(StrictModel):

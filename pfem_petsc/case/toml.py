@@ -6,7 +6,7 @@ import difflib
 import json
 import re
 import tomllib
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from itertools import chain
 from pathlib import Path, PurePath
 from typing import Any
@@ -123,19 +123,14 @@ def plain(value: Any) -> Any:
     if isinstance(value, Mapping):
         return {str(key): plain(item) for key, item in value.items()}
     if isinstance(value, list | tuple | range):
-        if _has_rows(value):  # of which tables over time may have many
-            return list(map(list, value))
+        if set(map(type, value)) == {list} and set(map(type, chain.from_iterable(value))) <= {float, int, str, bool}:
+            return list(map(list, value))  # tables over time may have many rows
         return [plain(item) for item in value]
     if hasattr(value, "tolist"):
         return value.tolist()
     if hasattr(value, "as_table"):  # a table of a case
         return plain(value.as_table(given=True))
     return str(value) if isinstance(value, PurePath) else value
-
-
-def _has_rows(value: Sequence[Any]) -> bool:
-    """Whether a list has lists of plain values alone."""
-    return set(map(type, value)) == {list} and set(map(type, chain.from_iterable(value))) <= {float, int, str, bool}
 
 
 def value_text(value: Any) -> str:

@@ -19,9 +19,9 @@ import difflib
 import importlib
 import os
 import shlex
-import shutil
 from collections.abc import Collection, Mapping
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -62,8 +62,12 @@ def suffixes(*what: str) -> dict[str, ModuleType]:
     """Return the module of each suffix; ``what`` are functions of which it must have one, as ``write``."""
     from ..registry import modules
 
-    found = [each for each in modules(__name__).values() if any(hasattr(each, name) for name in what)]
-    return {suffix: each for each in found for suffix in each.SUFFIXES}
+    return {
+        suffix: each
+        for each in modules(__name__).values()
+        if any(hasattr(each, name) for name in what)
+        for suffix in each.SUFFIXES
+    }
 
 
 def read_slab(path: Path, comm: MPI.Comm, fields: Mapping[str, str] | None = None) -> MeshSlab:
@@ -242,18 +246,15 @@ def write_whole(path: Path | str, mesh: WholeMesh) -> Path:
     given = path
     path = Path(path).absolute()
     writer = writer_of(path)
-    new = path.with_name(f".{path.name}.{os.getpid()}")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        new.mkdir()
-        try:
-            writer.write(new / path.name, mesh)
-            for file in sorted(new.iterdir()):
+        with TemporaryDirectory(prefix=f".{path.name}.", dir=path.parent, ignore_cleanup_errors=True) as folder:
+            new = Path(folder, path.name)
+            writer.write(new, mesh)
+            for file in sorted(new.parent.iterdir()):
                 os.replace(file, path.with_name(file.name))
-        finally:
-            shutil.rmtree(new, ignore_errors=True)
     except InputError as error:
-        raise InputError(str(error).replace(str(new / path.name), str(given))) from error
+        raise InputError(str(error).replace(str(new), str(given))) from error
     except (OSError, RuntimeError) as error:
         raise InputError(f"{path}: cannot be written: {getattr(error, 'strerror', None) or error}") from error
     return path

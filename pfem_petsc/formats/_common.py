@@ -39,6 +39,34 @@ def numbers_of(text: bytes) -> np.ndarray:
             raise ValueError(f"{shown(other)!r} is not a number") from None
 
 
+class NumberStream:
+    """Numbers of a text, or of binary data with a byte order, taken one after the other; a text has float64 alone."""
+
+    def __init__(self, content: bytes, order: str) -> None:
+        self._order, self._at = order, 0
+        self._all = content if order else numbers_of(content).tobytes()
+
+    @property
+    def left(self) -> int:
+        """How many bytes, of a text numbers, nothing has taken; white space at the end of a file is none."""
+        rest = self._all[self._at :]
+        return len(rest.strip()) if self._order else len(rest) // 8
+
+    def take(self, n: int, *kinds: str) -> np.ndarray:
+        """Return the next n rows of numbers of these types, with the fields ``0``, ``1``, ...
+
+        Raises
+        ------
+        EOFError
+            If there are not as many.
+        """
+        row = np.dtype([(f"{k}", self._order + kind if self._order else "f8") for k, kind in enumerate(kinds)])
+        start, self._at = self._at, self._at + n * row.itemsize
+        if not start <= self._at <= len(self._all):
+            raise EOFError("it ends early")
+        return np.ndarray((n,), row, self._all, start)
+
+
 def number_of(text: str) -> float:
     """Return a number, NaN for another text; Fortran's exponents (1.D+3) are known."""
     try:
@@ -104,12 +132,9 @@ def edges(pairs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 def drop_bare_nodes(path: Path, mesh: WholeMesh) -> None:
     """Remove nodes where no bar ends from a mesh, and tell their number."""
-    used = np.zeros(len(mesh.points), bool)
-    used[mesh.bars] = True
-    if used.all():
-        return
-    number = np.cumsum(used) - 1
-    mesh.warnings.append(f"{path}: left out {int((~used).sum())} points where no bar ends")
-    mesh.points, mesh.bars = mesh.points[used], number[mesh.bars]
-    mesh.node_groups = {name: number[own[used[own]]] for name, own in mesh.node_groups.items()}
+    used, bars = np.unique(mesh.bars, return_inverse=True)
+    left = len(mesh.points) - len(used)
+    mesh.tell(left, f"{path}: left out {left} points where no bar ends")
+    mesh.points, mesh.bars = mesh.points[used], bars.reshape(-1, 2)
+    mesh.node_groups = {name: np.flatnonzero(np.isin(used, own)) for name, own in mesh.node_groups.items()}
     mesh.node_fields = {name: values[used] for name, values in mesh.node_fields.items()}

@@ -34,6 +34,10 @@ _Rows = tuple[tuple[float, float], ...]
 """Times, or load factors, and values."""
 
 
+class _RemarkError(Exception):
+    """What is to be said about a keyword or a line, which is left out in most cases."""
+
+
 def read(path: Path, fields: Collection[str] | None = None) -> WholeMesh:
     """Return the mesh in an Abaqus input file, with the field ``area`` if all bars have a section.
 
@@ -85,53 +89,64 @@ def _add_materials(mesh: WholeMesh, deck: Deck) -> None:
     """Add the table of materials to a mesh."""
     for name, own in deck.materials.values():
         values: dict[str, Any] = {}
-        told = [(block, _material_value(block, values)) for block in own]
+        for block in own:
+            try:
+                _read_property(block, values)
+            except _RemarkError as remark:
+                mesh.warnings.append(f"{block.where}: {remark}")
         if values.get("cable") and len(values.get("plastic", ((), (0.0,)))[1]) > 1:
-            told.append((own[-1], "*PLASTIC with hardening is left out: bars without compression have none"))
+            text = "*PLASTIC with hardening is left out: bars without compression have none"
+            mesh.warnings.append(f"{own[-1].where}: {text}")
             del values["plastic"]
-        mesh.warnings += [f"{block.where}: {text}" for block, text in told if text]
         mesh.tables.setdefault("material", {})[name] = _material_keys(values)
 
 
-def _material_value(block: Block, material: dict[str, Any]) -> str:
-    """Read what belongs to a material; return what is to be said about it."""
+def _read_property(block: Block, material: dict[str, Any]) -> None:
+    """Add what a keyword says of a material to its values; a remark is raised."""
     match block.keyword:
         case "DAMPING":
             for name, key in (("ALPHA", "alpha"), ("BETA", "stiffness_damping")):
                 value = number_of(block.get(name)) if name in block.parameters else material.get(key, 0.0)
                 material[key] = 0.0 if np.isnan(value) else value
                 if np.isnan(value):
-                    return f"{block.get(name)!r} is not a number: left out"
-            return ""
+                    raise _RemarkError(f"{block.get(name)!r} is not a number: left out")
         case "NO TENSION":
-            return "left out: there is no law of bars that carry compression alone"
+            raise _RemarkError("left out: there is no law of bars that carry compression alone")
         case "NO COMPRESSION":
             material["cable"] = True
-            return ""
-    if block.get("TYPE", "ISOTROPIC").upper() not in ("ISOTROPIC", "ISO"):
-        return f"TYPE={block.get('TYPE')}: left out"
-    key, column = _PROPERTIES.get(block.keyword, ("plastic", 2))
-    rows = block.rows(8, 1)
-    if len(rows) == 0 or not np.isfinite(rows[0, 0]):
-        return "no values: left out"
-    if block.keyword in ("ELASTIC", "DENSITY") and rows[0, 0] <= 0.0:
-        return f"{rows[0, 0]:g} is not positive: left out"
-    first = rows[:, column]
-    cold = np.isnan(first) | (first == first[0]) if key == "plastic" else np.arange(len(rows)) == 0
-    told = "" if cold.all() else f"values at {first[0]:g} degrees are taken for all temperatures"
-    if key != "plastic":
-        material[key] = float(rows[0, 0])
-        return told
-    hardening = block.get("HARDENING", "ISOTROPIC").upper()
-    stress, strain = np.nan_to_num(rows[cold, :2]).T
-    if hardening != "ISOTROPIC" and not (hardening == "KINEMATIC" and len(stress) <= 2):
-        return f"HARDENING={hardening}: left out"
+        case keyword:
+            kind = block.get("TYPE", "ISOTROPIC")
+            if kind.upper() not in ("ISOTROPIC", "ISO"):
+                raise _RemarkError(f"TYPE={kind}: left out")
+            key, column = _PROPERTIES.get(keyword, ("plastic", 2))
+            rows = block.rows(8, 1)
+            if len(rows) == 0 or not np.isfinite(rows[0, 0]):
+                raise _RemarkError("no values: left out")
+            negative = keyword in ("ELASTIC", "DENSITY") and rows[0, 0] <= 0.0
+            if negative:
+                raise _RemarkError(f"{rows[0, 0]:g} is not positive: left out")
+            first = rows[:, column]
+            cold = np.isnan(first) | (first == first[0]) if key == "plastic" else np.arange(len(rows)) == 0
+            material[key] = _hardening(block, rows[cold, :2]) if key == "plastic" else float(rows[0, 0])
+            told = f"values at {first[0]:g} degrees are taken for all temperatures"
+            if not cold.all():
+                raise _RemarkError(told)
+
+
+def _hardening(block: Block, rows: np.ndarray) -> tuple[str, np.ndarray, np.ndarray]:
+    """Return the kind of hardening, and stresses and plastic strains, from rows (n, 2)."""
+    kind = block.get("HARDENING", "ISOTROPIC").upper()
+    stress, strain = np.nan_to_num(rows).T
+    known = kind == "ISOTROPIC" or (kind == "KINEMATIC" and len(stress) <= 2)
+    falls = (np.diff(strain) <= 0.0).any() or (np.diff(stress) < 0.0).any()
+    if not known:
+        raise _RemarkError(f"HARDENING={kind}: left out")
     if "RATE" in block.parameters:
-        return "RATE: left out"
-    if strain[0] != 0.0 or stress[0] <= 0.0 or (np.diff(strain) <= 0.0).any() or (np.diff(stress) < 0.0).any():
-        return "a curve that does not start at plastic strain 0, or that falls: left out"
-    material["plastic"] = hardening, stress, strain
-    return told
+        raise _RemarkError("RATE: left out")
+    told = "a curve that does not start at plastic strain 0, or that falls: left out"
+    if strain[0] != 0.0 or stress[0] <= 0.0 or falls:
+        raise _RemarkError(told)
+    return kind, stress, strain
 
 
 def _material_keys(values: dict[str, Any]) -> dict[str, Any]:
@@ -177,8 +192,9 @@ def _add_sections(mesh: WholeMesh, deck: Deck) -> None:
         material = block.get("MATERIAL")
         if material:
             found["material"] = deck.materials.get(material.upper(), (material, []))[0]
-            told = f"{block.where}: DENSITY is left out: that of the material is taken"
-            mesh.tell("DENSITY" in block.parameters, told)
+            mesh.tell(
+                "DENSITY" in block.parameters, f"{block.where}: DENSITY is left out: that of the material is taken"
+            )
         elif block.keyword in ("BEAM GENERAL SECTION", "FRAME SECTION"):
             found |= _own_material(mesh, block, rows, group)
         sections[group] = {"bars": group, **found}
@@ -357,18 +373,20 @@ class _Conditions:
     def add(self) -> None:
         """Add the tables to the mesh, and warnings."""
         kinds = {"DLOAD": self._weigh, "CLOAD": self._push, "BOUNDARY": self._hold, "TEMPERATURE": self._heat}
-        steps = [each for each, in_step in self._deck.conditions if in_step]
-        new = [each for each in steps if each.keyword == "BOUNDARY" and each.get("OP").upper() == "NEW"]
+        of_step = [block for block, in_step in self._deck.conditions if in_step and block.keyword == "BOUNDARY"]
+        new = next((block for block in of_step if block.get("OP").upper() == "NEW"), None)
         for block, in_step in self._deck.conditions:
-            if block in new[:1]:
+            if block is new:
                 self._supports.clear()
                 self._held[:] = 0
             self._in_step, self._over = in_step, self._rows(block)
             told: defaultdict[str, list[str]] = defaultdict(list)
             for where, words in block.lines():
                 self._line = f"{where}: {', '.join(words)[:60]!r}"
-                told[kinds[block.keyword](block, words)].append(self._line)
-            told.pop("", None)
+                try:
+                    kinds[block.keyword](block, words)
+                except _RemarkError as remark:
+                    told[str(remark)].append(self._line)
             for reason, lines in told.items():
                 more = f" (and {len(lines) - 1} more lines)" if len(lines) > 1 else ""
                 self._mesh.tell(True, f"{lines[0]}{more} is {reason}")
@@ -425,43 +443,42 @@ class _Conditions:
 
     # ---- lines
 
-    def _weigh(self, block: Block, words: list[str]) -> str:
+    def _weigh(self, block: Block, words: list[str]) -> None:
+        told = "left out: only GRAV is read of distributed loads"
         if len(words) < 2 or words[1].upper() != "GRAV":
-            return "left out: only GRAV is read of distributed loads"
+            raise _RemarkError(told)
         values = np.array([_value(words, at) for at in range(2, 6)])
         if not np.isfinite(values).all():
-            return "left out: expected numbers"
+            raise _RemarkError("left out: expected numbers")
         key = tuple((values[0] * values[1:]).tolist()), self._over
         _, times = self._gravity.setdefault(key, (self._line, np.zeros(len(self._mesh.bars), np.int64)))
         times[self._deck.members_of("ELSET", block, words[0]) if words[0] else slice(None)] += 1
-        return ""
 
-    def _push(self, block: Block, words: list[str]) -> str:
+    def _push(self, block: Block, words: list[str]) -> None:
         axis, value = _value(words, 1), _value(words, 2)
-        if axis not in (1.0, 2.0, 3.0) or not np.isfinite(value):
-            return "left out: only forces along x, y and z are read"
+        along = axis in _AXES and np.isfinite(value)
+        if not along:
+            raise _RemarkError("left out: only forces along x, y and z are read")
         name, _ = self._group(block, words[0])
-        if name:
-            self._forces.setdefault((name, self._over), np.zeros(3))[int(axis) - 1] += value
-        return "" if name else "left out: it names no node where a bar ends"
+        self._forces.setdefault((name, self._over), np.zeros(3))[int(axis) - 1] += value
 
-    def _hold(self, block: Block, words: list[str]) -> str:
+    def _hold(self, block: Block, words: list[str]) -> None:
         axes, value = _FIXED.get(words[1].upper() if len(words) > 1 else "", ""), 0.0
         if not axes:
             first, last, value = (_value(words, at) for at in (1, 2, 3))
             last = last or first
-            if not (1.0 <= first <= last <= 6.0 and np.isfinite(value)):
-                return "left out: expected degrees of freedom from 1 to 6, and a number"
+            known = 1.0 <= first <= last <= 6.0 and np.isfinite(value)
+            if not known:
+                raise _RemarkError("left out: expected degrees of freedom from 1 to 6, and a number")
             axes = "xyz"[int(first) - 1 : int(last)]  # bars have no rotations
         name, members = self._group(block, words[0])
-        if not name:
-            return "left out: it names no node where a bar ends"
         motion, told = self._motion(block, value) if axes and value else (_AT_REST, "")
         number = self._motions.setdefault(motion, len(self._motions) + 1)
         for axis in map("xyz".index, axes):
             self._supports[name, axis, motion] = members
             self._held[members, axis] = number
-        return told
+        if told:
+            raise _RemarkError(told)
 
     def _motion(self, block: Block, value: float) -> tuple[tuple[str, _Rows], str]:
         """Return a motion, as the key of a support and its rows, and what is to be said about one that is not there."""
@@ -482,21 +499,20 @@ class _Conditions:
             told = f"TYPE={kind} is not read {'in a static step' if self._static else 'with AMPLITUDE'}"
         return _AT_REST, f"held where it is: {told}"
 
-    def _heat(self, block: Block, words: list[str]) -> str:
-        value = _value(words, 1)
+    def _heat(self, block: Block, words: list[str]) -> None:
+        value, told = _value(words, 1), "left out: expected nodes and a temperature"
         if not np.isfinite(value) or len(words) < 2:
-            return "left out: expected nodes and a temperature"
+            raise _RemarkError(told)
+        told = "left out: temperatures act in *STATIC and *DYNAMIC steps"
         if not (self._static or self._dynamic):
-            return "left out: temperatures act in *STATIC and *DYNAMIC steps"
+            raise _RemarkError(told)
         self._temperatures.append((self._deck.members_of("NSET", block, words[0]), value, self._over))
-        return ""
 
     def _group(self, block: Block, target: str) -> tuple[str, np.ndarray]:
-        """Return the name of the node group with the nodes of a set, or of the node of a label, and its members; empty
-        without nodes."""
+        """Return the name of the node group with the nodes of a set, or of the node of a label, and its members."""
         members, groups = self._deck.members_of("NSET", block, target), self._mesh.node_groups
         if len(members) == 0:
-            return "", members
+            raise _RemarkError("left out: it names no node where a bar ends")
         wanted = target.replace('"', "").replace("/", "_")
         last = wanted.rpartition(".")[2]
         new = f"node_{wanted}" if last.isdecimal() else wanted
@@ -547,8 +563,7 @@ class _Conditions:
         every: list[tuple[np.ndarray, _Rows]] = []
         for (vector, rows), (line, times) in self._gravity.items():
             every.append((times.min() * np.array(vector), rows))
-            uneven = times.max() > times.min()
-            self._mesh.tell(uneven, f"{line} is left out: the gravity of a case acts on all bars")
+            self._mesh.tell(times.max() > times.min(), f"{line} is left out: the gravity of a case acts on all bars")
         total = sum((vector for vector, _ in every), np.zeros(3))
         if not any(rows for _, rows in every):
             return {"gravity": {"acceleration": total.tolist()}} if total.any() else {}
@@ -560,8 +575,7 @@ class _Conditions:
         """Return the temperatures of bars, the means of those of their nodes, above the initial ones."""
         mesh = self._mesh
         initial = np.zeros(len(mesh.points))
-        expected = "expected nodes and a temperature"
-        for members, (value,) in _initial_values(mesh, self._deck, "TEMPERATURE", expected):
+        for members, (value,) in _initial_values(mesh, self._deck, "TEMPERATURE", "expected nodes and a temperature"):
             initial[members] = value
         times = self._times([rows for _, _, rows in self._temperatures])
         above = np.zeros((len(initial), len(times)))
@@ -596,7 +610,12 @@ class _Conditions:
         known: set[int] = set()
         for block, elements in self._deck.of_nodes():
             known |= {id(element) for element, _ in elements}
-            told = Counter(self._add_of_nodes(block, *element, values, tables) for element in elements)
+            told: Counter[str] = Counter()
+            for element in elements:
+                try:
+                    self._add_of_nodes(block, *element, values, tables)
+                except _RemarkError as remark:
+                    told[str(remark)] += 1
             for why, number in told.items():
                 self._mesh.tell(why, f"{block.where}: left out {number} elements: {why}")
         every = {id(element) for scope in self._deck.scopes.values() for element in scope.at_nodes}
@@ -622,8 +641,8 @@ class _Conditions:
         nodes: list[int],
         values: dict[str, np.ndarray],
         tables: dict[str, dict[str, dict[str, Any]]],
-    ) -> str:
-        """Add an element that belongs to nodes to the values of nodes or to the tables; return why not."""
+    ) -> None:
+        """Add an element that belongs to nodes to the values of nodes or to the tables; a remark says why not."""
         odd = [name for name in ("NONLINEAR", "ORIENTATION") if name in block.parameters]
         odd += [f"TYPE={kind}" for kind in [block.get("TYPE", "ISO")] if kind.upper() not in ("ISOTROPIC", "ISO")]
         lines = [words for _, words in block.lines()]
@@ -633,26 +652,27 @@ class _Conditions:
         free = not directed and len(lines) > 1 and lines[0][0] in ("1", "2", "3", "0")
         data = lines[int(directed or free) :]
         value = _value(data[0], 0) if data else np.nan
-        for wrong, text in (
-            (odd, f"{', '.join(odd[:1])} is not read"),
-            (not 0.0 < value < np.inf, "expected a positive number"),
-            (min(nodes) < 0, "no bar ends at their nodes"),
-            (any(axis not in _AXES for axis in axes), "bars have the degrees of freedom 1, 2 and 3 alone"),
-        ):
-            if wrong:
-                return text
+        if odd:
+            raise _RemarkError(f"{', '.join(odd[:1])} is not read")
+        if not 0.0 < value < np.inf:
+            raise _RemarkError("expected a positive number")
+        if min(nodes) < 0:
+            raise _RemarkError("no bar ends at their nodes")
+        beyond = any(axis not in _AXES for axis in axes)
+        if beyond:
+            raise _RemarkError("bars have the degrees of freedom 1, 2 and 3 alone")
         if len(nodes) == 1:
             values[block.keyword][nodes[0], int(axes[0]) - 1 if axes else 0] += value
-            return ""
+            return
         line = self._mesh.points[nodes[1]] - self._mesh.points[nodes[0]]
-        if axes and not (axes[0] == axes[1] and np.count_nonzero(line) == 1 and line[int(axes[0]) - 1]):
-            return "those of a case act along the line between their nodes"
+        along = not axes or (axes[0] == axes[1] and np.count_nonzero(line) == 1 and line[int(axes[0]) - 1])
+        if not along:
+            raise _RemarkError("those of a case act along the line between their nodes")
         labels = [f"node_{instance}.{label}" if instance else f"node_{label}" for instance, label in element.nodes]
         groups, own = self._mesh.node_groups, tables[block.keyword.lower()]
         names = [name_of(groups, np.array([node]), label) for node, label in zip(nodes, labels)]
         key = {"SPRING": "stiffness", "DASHPOT": "coefficient"}[block.keyword]
         own[free_name(own, " to ".join(names))] = {"between": names, key: value}
-        return ""
 
 
 def _times_value(rows: _Rows, value: float) -> _Rows:

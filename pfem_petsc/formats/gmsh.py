@@ -18,7 +18,7 @@ import numpy as np
 
 from ..errors import InputError
 from ..mesh.whole import WholeMesh
-from ._common import numbers_of, places_of, shown, whole_numbers
+from ._common import NumberStream, numbers_of, places_of, shown, whole_numbers
 
 SUFFIXES = (".msh",)
 
@@ -77,8 +77,7 @@ def read(path: Path, fields: Collection[str] | None = None) -> WholeMesh:
     mesh = WholeMesh(points, ends.reshape(-1, 2))
     mesh.node_groups = elements.groups(names[0], len(points), of_points, marked[:, 1])
     mesh.bar_groups = elements.groups(names[1], len(lines), np.arange(len(lines)), lines[:, 3])
-    told = f"{path}: left out {elements.others} elements that are neither lines nor points"
-    mesh.tell(elements.others, told)
+    mesh.tell(elements.others, f"{path}: left out {elements.others} elements that are neither lines nor points")
     for kind, what, tags, found in (
         ("ElementData", "line", lines[:, 0], mesh.bar_fields),
         ("NodeData", "node", node_tags, mesh.node_fields),
@@ -141,22 +140,18 @@ def _sections(path: Path, content: bytes) -> dict[str, list[bytes]]:
     return found
 
 
-class _Numbers:
-    """Numbers of one section of a file, taken one after the other.
+class _Numbers(NumberStream):
+    """Numbers of one section of a file.
 
     Every method raises InputError if the section ends early or has other content than requested.
     """
 
     def __init__(self, where: str, payload: bytes, layout: _Layout) -> None:
         self.where, self.layout = where, layout
-        self._at = 0  # the next byte of a binary file, number of a text
-        self._all = payload if layout.binary else self._parsed(payload)
-
-    def _parsed(self, text: bytes) -> np.ndarray:
         try:
-            return numbers_of(text)
+            super().__init__(payload, layout.order if layout.binary else "")
         except ValueError:
-            for number, line in enumerate(text.split(b"\n"), 1):
+            for number, line in enumerate(payload.split(b"\n"), 1):
                 try:
                     numbers_of(line)
                 except ValueError as error:
@@ -186,23 +181,25 @@ class _Numbers:
 
     def reals(self, n: int, kind: str = "f8") -> np.ndarray:
         """Return the next ``n`` numbers, of a NumPy type in a binary file."""
-        start, kind = self._at, np.dtype(kind).newbyteorder(self.layout.order)
-        self._at += n * kind.itemsize if self.layout.binary else n
-        if not start <= self._at <= len(self._all):
-            raise InputError(f"{self.where}: its counts declare more numbers than it has; is it truncated?")
-        return np.ndarray((n,), kind, self._all, start) if self.layout.binary else self._all[start : self._at]
+        return self.take(n, kind)["0"]
+
+    def take(self, n: int, *kinds: str) -> np.ndarray:
+        """Return the next ``n`` rows of numbers of these types."""
+        try:
+            return super().take(n, *kinds)
+        except EOFError:
+            text = "its counts declare more numbers than it has; is it truncated?"
+            raise InputError(f"{self.where}: {text}") from None
 
     def rows(self, n: int, n_reals: int) -> tuple[np.ndarray, np.ndarray]:
         """Return the next ``n`` rows of an integer and ``n_reals`` floating-point numbers."""
-        if self.layout.binary:
-            rows = self.reals(n, f"i4,({n_reals},)f8")
-            return self._whole(rows["f0"]), rows["f1"].astype(np.float64)
-        rows = self.reals(n * (1 + n_reals)).reshape(n, 1 + n_reals)
-        return self._whole(rows[:, 0]), rows[:, 1:].copy()
+        rows = self.take(n, "i4", *["f8"] * n_reals)
+        reals = np.stack([rows[name] for name in rows.dtype.names[1:]], axis=1)
+        return self._whole(rows["0"]), reals.astype(np.float64)
 
     def ahead(self, n: int) -> np.ndarray:
         """Return at most the next ``n`` numbers of a text without taking them."""
-        return self._all[self._at : self._at + n]
+        return np.frombuffer(self._all)[self._at // 8 : self._at // 8 + n]
 
     def blocks(self, what: str) -> Iterator[list[int]]:
         """Yield three integers and the number of ``what`` at the head of each block of version 4."""
@@ -219,8 +216,7 @@ class _Numbers:
 
     def end(self) -> None:
         """Refuse surplus numbers."""
-        left = self._all[self._at :]
-        if len(left.strip() if self.layout.binary else left):
+        if self.left:
             raise InputError(f"{self.where}: has more numbers than its counts declare")
 
     def _whole(self, values: np.ndarray) -> np.ndarray:

@@ -163,8 +163,10 @@ def _add_sections(path: Path, mesh: WholeMesh, deck: Any, bars: list[Any], told:
         bare |= set() if size else {group}
         area[numbers] = size or np.nan
         tube = source.type == "PTUBE"
-        two = tube and source.OD2 not in (None, source.OD1)
-        told(two, f"PTUBE {source.pid} has two diameters: its area is their mean")
+        told(
+            tube and source.OD2 not in (None, source.OD1),
+            f"PTUBE {source.pid} has two diameters: its area is their mean",
+        )
         shape = {"shape": "tube", "thickness": source.t} if tube and 0.0 < source.t < 0.5 * source.OD1 else {}
         own = {"area": size} if size else {}
         sections[group] = {"bars": group, **own, **shape, "material": f"mat1_{source.mid}"}
@@ -289,8 +291,7 @@ class _Conditions:
             values[self._at[card.nid]] += card.mass * _mass_scale(self._deck)
         others = sum(card.nid not in self._at for card in cards)
         self._told(others, f"left out {others} CONM2 where no bar ends")
-        found = self._tables(values, lambda _: "mass")
-        return {name: {"node_set": name, "value": value} for (value,), name in found}
+        return {name: {"node_set": name, "value": value} for (value,), name in self._tables(values, lambda _: "mass")}
 
     def _loads(self) -> dict[str, dict[str, Any]]:
         """Return loads and gravity, or load cases if subcases of a linear static solution have different loads."""

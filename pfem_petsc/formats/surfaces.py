@@ -19,7 +19,7 @@ import numpy as np
 
 from ..errors import InputError
 from ..mesh.whole import WholeMesh
-from ._common import drop_bare_nodes, edges, numbers_of, whole_numbers
+from ._common import NumberStream, drop_bare_nodes, edges, numbers_of, whole_numbers
 
 SUFFIXES = (".obj", ".ply", ".stl")
 
@@ -177,13 +177,13 @@ def _ply(path: Path) -> _Content:
         raise InputError(f"{path}: is not PLY: it does not begin with 'ply' and a header")
     order, elements = _header(path, head[1].decode("ascii", "replace"))
     try:
-        body = _Body(order, content[head.end() :])
+        body = _Body(content[head.end() :], order)
         tables = {name: body.table(n, properties) for name, (n, properties) in elements.items()}
         points = np.stack([tables["vertex"].pop(axis) for axis in "xyz"], axis=1)
         ends, faces = tables.get("edge", {}), tables.get("face", {})
         lines = np.stack([ends.pop(key) for key in ("vertex1", "vertex2")], axis=1) if ends else np.empty((0, 2))
         corners, offsets = next((faces[key] for key in ("vertex_indices", "vertex_index") if key in faces), ([], [0]))
-    except (ValueError, KeyError) as error:
+    except (ValueError, KeyError, EOFError) as error:
         what = f"the header has no {error}" if isinstance(error, KeyError) else error
         raise InputError(f"{path}: {what}: expected vertices with x, y and z, and edges or faces of them") from None
     left = [f"{n} {name}" for name, (n, _) in elements.items() if name not in ("vertex", "edge", "face")]
@@ -218,37 +218,19 @@ def _header(path: Path, text: str) -> tuple[str, dict[str, tuple[int, Properties
     return order, elements
 
 
-class _Body:
-    """The numbers after the header, taken one after the other; those of a text are all float64."""
-
-    def __init__(self, order: str, content: bytes) -> None:
-        self._order, self._at = order, 0
-        self._all = content if order else numbers_of(content).tobytes()
-
-    @property
-    def left(self) -> int:
-        """How many bytes, of text numbers, nothing has taken; white space at the end of the file is none."""
-        rest = self._all[self._at :]
-        return len(rest.strip()) if self._order else len(rest) // 8
-
-    def _take(self, n: int, *kinds: str) -> np.ndarray:
-        """Return the next n rows of numbers of these types."""
-        row = np.dtype([(f"{k}", self._order + kind if self._order else "f8") for k, kind in enumerate(kinds)])
-        start, self._at = self._at, self._at + n * row.itemsize
-        if self._at > len(self._all):
-            raise ValueError("it ends early")
-        return np.ndarray((n,), row, self._all, start)
+class _Body(NumberStream):
+    """The numbers after the header."""
 
     def table(self, n: int, properties: Properties) -> dict[str, np.ndarray | tuple[np.ndarray, np.ndarray]]:
         """Return the properties by name: numbers (n,), of lists all members and where the list of each begins."""
         if all(len(types) == 1 for _, types in properties):
-            rows = self._take(n, *(types[0] for _, types in properties))
+            rows = self.take(n, *(types[0] for _, types in properties))
             return {name: rows[f"{k}"].astype(np.float64) for k, (name, _) in enumerate(properties)}
         found: dict[str, list[np.ndarray]] = {name: [] for name, _ in properties}
         for _ in range(n):
             for name, types in properties:
-                length = int(self._take(1, types[0])["0"][0]) if len(types) == 2 else 1
-                found[name].append(self._take(length, types[-1])["0"])
+                length = int(self.take(1, types[0])["0"][0]) if len(types) == 2 else 1
+                found[name].append(self.take(length, types[-1])["0"])
         whole = {name: np.concatenate([np.empty(0), *parts]) for name, parts in found.items()}
         starts = {name: np.cumsum([0, *map(len, found[name])]) for name, types in properties if len(types) == 2}
         return {name: (values, starts[name]) if name in starts else values for name, values in whole.items()}

@@ -83,8 +83,7 @@ def read(path: Path, fields: Collection[str] | None = None) -> WholeMesh:
     mesh.tell(left_out, f"{path}: left out {left_out} cells that are not {'faces' if faces else 'lines'}")
     if left_out or faces:
         drop_bare_nodes(path, mesh)
-    several = snapshots > 1
-    mesh.tell(several, f"{path}: has {snapshots} snapshots: the mesh and its fields are those of the last one")
+    mesh.tell(snapshots > 1, f"{path}: has {snapshots} snapshots: the mesh and its fields are those of the last one")
     return mesh
 
 

@@ -239,9 +239,8 @@ def _fetch_bars(
     rows = np.concatenate([np.arange(n_bars, dtype=kind), both])
     to_owners = Router(comm, np.concatenate([owner[:, 0], owner[both, 1]]), rows)
     del owner, both, rows
-    groups = {
-        name: to_owners.send(_membership(members - slab.first_bar, n_bars)) for name, members in slab.bar_groups.items()
-    }
+    numbers_here = np.arange(slab.first_bar, slab.first_bar + n_bars)
+    groups = {name: to_owners.send(np.isin(numbers_here, members)) for name, members in slab.bar_groups.items()}
     fields = {name: to_owners.send(values) for name, values in slab.bar_fields.items()}
     ids = to_owners.send(np.arange(slab.first_bar, slab.first_bar + n_bars, dtype=index_type(slab.n_bars)))
     return to_owners.send(numbers), ids, to_owners.send(section), groups, fields
@@ -270,13 +269,6 @@ def _arranged(
         start += counted + others
     members = {name: np.flatnonzero(mask[order]).astype(np.int32) for name, mask in groups.items()}
     return ends[order], bar_ids[order], blocks, members, {name: values[order] for name, values in fields.items()}
-
-
-def _membership(members: np.ndarray, n: int) -> np.ndarray:
-    """Return (n,) bool: True for the members."""
-    mask = np.zeros(n, bool)
-    mask[members] = True
-    return mask
 
 
 def _owner(numbers: np.ndarray, starts: np.ndarray) -> np.ndarray:
@@ -347,8 +339,7 @@ def _members_of(case: Case, where: str, node_set: NodeSet, mesh: DistributedMesh
         return np.sort(mesh.node_groups[str(node_set.selection)])
     if node_set.indices is not None:
         wanted = np.array(node_set.indices, dtype=np.int64)
-        outside = wanted[(wanted < 0) | (wanted >= mesh.n_nodes)]
-        for node in outside[:1]:
+        for node in wanted[(wanted < 0) | (wanted >= mesh.n_nodes)][:1]:
             raise InputError(f"{where}.indices: node {node} does not exist; the mesh has nodes 0 to {mesh.n_nodes - 1}")
         return np.flatnonzero(np.isin(ids, wanted))
     return np.arange(mesh.n_owned)

@@ -174,8 +174,7 @@ class GhostExchange:
     def __init__(self, comm: MPI.Comm, starts: np.ndarray, ghosts: np.ndarray, tag: int = _TAG) -> None:
         self._comm, self._tag = comm, tag
         self._n_owned, self._n_ghosts = int(starts[comm.rank + 1] - starts[comm.rank]), len(ghosts)
-        owners = np.searchsorted(starts, ghosts, side="right") - 1
-        router = Router(comm, owners)
+        router = Router(comm, np.searchsorted(starts, ghosts, side="right") - 1)
         asked = router.send(np.asarray(ghosts, dtype=np.int64))
         self.rows = (asked - starts[comm.rank]).astype(np.intp)
         self._leaving, self._arriving = _neighbours(router._arriving), _neighbours(router._counts)

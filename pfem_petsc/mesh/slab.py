@@ -257,9 +257,8 @@ def _array(where: str, name: str, values: ArrayLike, width: int, kinds: str) -> 
 
 def _field(source: str, name: str, values: ArrayLike, n: int) -> np.ndarray:
     """Return the values of a cell field."""
-    where = f"{source}: bar_fields[{name!r}]"
+    where, array = f"{source}: bar_fields[{name!r}]", np.asarray(values)
     _check_name(where, name)
-    array = np.asarray(values)
     if array.shape != (n,) or array.dtype.kind not in "fiu":
         raise InputError(f"{where} has shape {array.shape} and type {array.dtype}; expected ({n},) numbers")
     return array.astype(np.float64)
@@ -272,13 +271,11 @@ def _check_name(where: str, name: str) -> None:
 
 def _members(source: str, kind: str, name: str, values: ArrayLike, n: int) -> np.ndarray:
     """Return the numbers of the members of a group, ascending."""
-    where = f"{source}: {kind}[{name!r}]"
+    where, array = f"{source}: {kind}[{name!r}]", np.asarray(values)
     _check_name(where, name)
-    array = np.asarray(values)
     if array.dtype.kind == "b" and array.shape == (n,):
         return np.flatnonzero(array)
-    if array.size == 0:
-        return np.empty(0, np.int64)
+    array = array if array.size else np.empty(0, np.int64)
     if array.ndim != 1 or array.dtype.kind not in "iu":
         raise InputError(
             f"{where} has shape {array.shape} and type {array.dtype}; expected a list of numbers from 0, or ({n},) "

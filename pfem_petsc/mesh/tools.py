@@ -162,8 +162,7 @@ def merged(meshes: Sequence[WholeMesh], tolerance: float | None = None) -> tuple
         fields = [getattr(mesh, kind) for mesh in meshes]
         common = set(fields[0]).intersection(*fields)
         setattr(together, kind, {name: np.concatenate([own[name] for own in fields]) for name in sorted(common)})
-        others = sorted(set().union(*fields) - common)
-        done += [f"field {name} left out: not all files have it" for name in others]
+        done += [f"field {name} left out: not all files have it" for name in sorted(set().union(*fields) - common)]
     for mesh in meshes:
         together.warnings += mesh.warnings
         for table, rows in mesh.tables.items():

@@ -327,7 +327,7 @@ def generate_on(
             f"mesh: the arrays of rank {rank} differ from those of rank 0: give all ranks the same arrays, or rank 0 "
             "alone, by Truss(..., comm=comm)"
         )
-    if not found[0][1]:  # nobody has, or not the one that would send them
+    if not found[0][1]:
         raise InputError(
             f"mesh: the arrays of this case (digest {str(digest)[:12]}...) are not in its text, as they are large: "
             "give the truss, as in Case.load(path, mesh=truss)"

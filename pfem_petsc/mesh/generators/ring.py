@@ -44,8 +44,7 @@ def generate(parameters: Parameters, rank: int, size: int) -> MeshSlab:
     bar groups ``outer``, ``inner``, ``radial``, ``diagonal``.
     """
     n = parameters.bays
-    n_bars = (5 if parameters.bracing == "x" else 4) * n
-    part = Part(2 * n, n_bars, rank, size, "mesh.bays")
+    part = Part(2 * n, (5 if parameters.bracing == "x" else 4) * n, rank, size, "mesh.bays")
     family, bay = np.divmod(part.bars, n)
     after = (bay + 1) % n
     start = np.choose(family, [bay, n + bay, bay, bay, n + bay])

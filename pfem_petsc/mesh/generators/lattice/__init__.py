@@ -111,12 +111,10 @@ def _uncut(block: Block, rank: int, size: int, wanted: _Wanted) -> MeshSlab:
     ends, *marks = block.bars.arrays(bars, of_bars)
     groups = {name: nodes[0] + np.flatnonzero(mark) for name, mark in zip(block.faces, faces)}
     slab = MeshSlab(block.nodes.total, block.bars.total, nodes[0], points, bars[0], ends, groups)
-    slab.bar_groups = {name: bars[0] + np.flatnonzero(mark) for name, mark in zip(wanted.groups, marks)}
-    slab.bar_fields = dict(zip(wanted.fields, marks[len(wanted.groups) :]))
     slab.volume = block.volume if block.keys.map is None else None
     if block.disturbed:
         (slab.undisturbed,) = block.nodes.arrays(nodes, lambda *at: [block.positions(*at, disturbed=False)])
-    return _named(slab, block)
+    return _completed(slab, block, wanted, marks)
 
 
 def _of_bars(block: Block, places: Places, wanted: _Wanted, ends: list[np.ndarray]) -> list[np.ndarray]:
@@ -127,7 +125,10 @@ def _of_bars(block: Block, places: Places, wanted: _Wanted, ends: list[np.ndarra
     return [groups[name] for name in wanted.groups] + fields
 
 
-def _named(slab: MeshSlab, block: Block) -> MeshSlab:
+def _completed(slab: MeshSlab, block: Block, wanted: _Wanted, marks: list[np.ndarray]) -> MeshSlab:
+    """Give a slab what is wanted of its bars, see :func:`_of_bars`, its source and warnings."""
+    slab.bar_groups = {name: slab.first_bar + np.flatnonzero(mark) for name, mark in zip(wanted.groups, marks)}
+    slab.bar_fields = dict(zip(wanted.fields, marks[len(wanted.groups) :]))
     slab.structured = block.keys.map is None  # a map may make nodes of a bar meet
     slab.source = f"generator lattice ({block.keys.kind})"
     slab.warnings = mechanism_warning(block.keys.kind, block.cell)
@@ -219,8 +220,7 @@ class _Left:
         clear = np.abs(distance).sum(axis=1) > longest
         touching = np.flatnonzero(~clear & (inside.any(axis=1) if clip else inside.all(axis=1)))
         starts, stops = self._end_points(touching)
-        strictly = (distance[touching] < -ON * longest).all(axis=1)
-        line, span = surface.inside_parts(starts, stops, strictly)
+        line, span = surface.inside_parts(starts, stops, (distance[touching] < -ON * longest).all(axis=1))
         entire = (span == (0.0, 1.0)).all(axis=1)
         whole = clear & inside.all(axis=1)
         whole[touching[line[entire]]] = True
@@ -270,8 +270,7 @@ class _Left:
             whole = [self.block.positions(*self.block.end(places, which)) for which in (0, 1)]
             left = self._end_points(cut)
             share[cut] = np.linalg.norm(left[1] - left[0], axis=1) / np.linalg.norm(whole[1] - whole[0], axis=1)
-        own = float(share @ self.block.cell_volumes(at)) / len(self.block.cell.ends)
-        return self._comm.allreduce(own)
+        return self._comm.allreduce(float(share @ self.block.cell_volumes(at)) / len(self.block.cell.ends))
 
     def renumbered(self, wanted: _Wanted) -> MeshSlab:
         """Return this rank's part of what is left. Collective.
@@ -313,11 +312,9 @@ class _Left:
         ends, *marks = (moved(rows) for rows in (ends.astype(index_type(total + n_new)), *marks))
         slab = MeshSlab(total + n_new, n_bars, first_node, points, first_bar, ends, groups)
         slab.undisturbed = undisturbed
-        slab.bar_groups = {name: first_bar + np.flatnonzero(mark) for name, mark in zip(wanted.groups, marks)}
-        slab.bar_fields = dict(zip(wanted.fields, marks[len(wanted.groups) :]))
         if keys.keep is None and keys.map is None:  # else it is not known what the lattice fills
             slab.volume = self._surface.volume if self._surface is not None else block.volume
-        _named(slab, block)
+        _completed(slab, block, wanted, marks)
         if self._surface is not None:
             slab.warnings = self._surface.warnings + slab.warnings
             if slab.volume is not None and keys.curved is None and not keys.missing:

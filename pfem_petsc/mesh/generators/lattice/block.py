@@ -63,13 +63,11 @@ class CellKeys(StrictModel):
             if any(abs(i) > 1 for i in strut[2:]):
                 raise ValueError(f"{where}: expected -1, 0 or 1 for the cell of the second point")
         for name, members in (self.groups or {}).items():
-            if wrong := [m for m in members if m >= len(self.struts)]:
-                raise ValueError(
-                    f"groups.{name}: there is no strut {wrong[0]}: they go from 0 to {len(self.struts) - 1}"
-                )
+            for wrong in [m for m in members if m >= len(self.struts)][:1]:
+                raise ValueError(f"groups.{name}: there is no strut {wrong}: they go from 0 to {len(self.struts) - 1}")
         cell = self.made()
-        if bare := sorted(set(range(len(cell.points))) - set(cell.ends.ravel().tolist())):
-            raise ValueError(f"the point at {cell.points[bare[0]].tolist()} belongs to no strut")
+        for bare in np.setdiff1d(np.arange(len(cell.points)), cell.ends)[:1]:
+            raise ValueError(f"the point at {cell.points[bare].tolist()} belongs to no strut")
         return self
 
     def made(self) -> UnitCell:
@@ -104,6 +102,8 @@ class FieldKeys(StrictModel):
 class CurvedKeys(StrictModel):
     """A map of the block to a curved shell, ``[mesh.curved]``."""
 
+    conflicts = ((lambda own: own.closed and own.shape != "cylinder", 'closed = true needs shape = "cylinder"'),)
+
     shape: Literal["cylinder", "sphere"]
     """``cylinder``: x around the y axis; ``sphere``: x and y along great circles; both z outwards"""
     radius: PositiveFloat
@@ -111,15 +111,36 @@ class CurvedKeys(StrictModel):
     closed: bool = False
     """cylinder: whether the block goes all the way around, and its ends are joined"""
 
-    @model_validator(mode="after")
-    def _what_closes(self) -> CurvedKeys:
-        if self.closed and self.shape != "cylinder":
-            raise ValueError('closed = true needs shape = "cylinder"')
-        return self
-
 
 class Parameters(StrictModel):
     """Keys of ``[mesh]`` with ``generator = "lattice"``."""
+
+    conflicts = (
+        (
+            lambda own: own.curved is not None and own.map is not None,
+            "map and the table [mesh.curved] exclude each other: give one of them",
+        ),
+        (
+            lambda own: own.cells is None and (own.surface is None or own.curved is not None or own.map is not None),
+            "the key cells is missing: number of cells along x, y and z",
+        ),
+        (
+            lambda own: (own.kind == "cell") != (own.cell is not None),
+            'kind = "cell" and the table [mesh.cell] with points and struts need each other',
+        ),
+        (
+            lambda own: own.angle is not None and own.kind != "auxetic",
+            f'angle belongs to kind = "auxetic" (default {ANGLE:g}), not to {{0.kind!r}}',
+        ),
+        (
+            lambda own: own.seed is not None and not (own.perturbation or own.missing),
+            "seed needs perturbation or missing",
+        ),
+        (
+            lambda own: own.curved is not None and own.curved.closed and own.cells is not None and own.cells[0] < 3,
+            "curved.closed = true needs 3 cells or more along x",
+        ),
+    )
 
     kind: Literal[
         "cubic",
@@ -194,27 +215,6 @@ class Parameters(StrictModel):
             if not can_be_variable(name):
                 raise ValueError(f"fields.{name}: expected a name of letters, digits and underscores")
         self.expressions()
-        curved, shell = self.curved is not None, self.curved is not None and self.curved.closed
-        needs_cells = self.surface is None or curved or self.map is not None
-        for wrong, text in (
-            (curved and self.map is not None, "map and the table [mesh.curved] exclude each other: give one of them"),
-            (needs_cells and self.cells is None, "the key cells is missing: number of cells along x, y and z"),
-            (
-                (self.kind == "cell") != (self.cell is not None),
-                'kind = "cell" and the table [mesh.cell] with points and struts need each other',
-            ),
-            (
-                self.angle is not None and self.kind != "auxetic",
-                f'angle belongs to kind = "auxetic" (default {ANGLE:g}), not to {self.kind!r}',
-            ),
-            (self.seed is not None and not (self.perturbation or self.missing), "seed needs perturbation or missing"),
-            (
-                shell and self.cells is not None and self.cells[0] < 3,
-                "curved.closed = true needs 3 cells or more along x",
-            ),
-        ):
-            if wrong:
-                raise ValueError(text)
         return self
 
     def expressions(self) -> Fields:

@@ -115,65 +115,27 @@ def _unit(*axes: int) -> np.ndarray:
     return np.array([int(axis in axes) for axis in range(3)])
 
 
-def _corners_to_faces() -> list[list[int]]:
-    return [
-        [0, 1 + axis, *(-corner)]
-        for axis, (first, second) in enumerate(((1, 2), (0, 2), (0, 1)))
-        for corner in (_unit(), _unit(first), _unit(second), _unit(first, second))
-    ]
-
-
-def _cubic() -> UnitCell:
-    """Edges along x, y, z, then the two diagonals of the faces normal to z, to y and to x."""
-    across = [way for a, b in ((0, 1), (0, 2), (1, 2)) for way in (_unit(a, b), _unit(b) - _unit(a))]
-    struts = [*_EDGES, *([0, 0, *way] for way in across)]
-    return cell_of([_CORNER], struts, {"edges": range(3), "diagonals": range(3, 9)}, item_by_item=True)
-
-
-def _octet() -> UnitCell:
-    """Struts from corners to face centres, then those of the octahedron of face centres."""
-    struts = _corners_to_faces()
-    for one, two in ((0, 1), (0, 2), (1, 2)):
-        struts += [[1 + one, 1 + two, *(b - a)] for a in (_unit(), _unit(one)) for b in (_unit(), _unit(two))]
-    groups = {"face_struts": range(12), "octahedra": range(12, 24)}
-    return cell_of([_CORNER, *_FACE_CENTRES], struts, groups, item_by_item=True)
-
-
-def _fcc() -> UnitCell:
-    """Both diagonals of every face, which cross in a node."""
-    return cell_of([_CORNER, *_FACE_CENTRES], _corners_to_faces(), {"diagonals": range(12)})
-
-
-def _bcc() -> UnitCell:
-    """Cube edges along x, y, z, then the eight half diagonals."""
-    groups = {"edges": range(3), "diagonals": range(3, 11)}
-    return cell_of([_CORNER, (0.5, 0.5, 0.5)], _EDGES + _HALF_DIAGONALS, groups, item_by_item=True)
-
-
-def _bcc_diagonals() -> UnitCell:
-    """The eight half diagonals."""
-    return cell_of([_CORNER, (0.5, 0.5, 0.5)], _HALF_DIAGONALS, {"diagonals": range(8)})
-
-
-def _kelvin() -> UnitCell:
-    """Truncated octahedra about the corners and the centre of the cube (tetrakaidecahedra)."""
-    points = sorted(set(itertools.permutations((0.0, 0.25, 0.5))) | set(itertools.permutations((0.0, 0.75, 0.5))))
-    return cell_of(points, neighbours(points, np.sqrt(2.0) / 4.0))
-
-
-def _diamond() -> UnitCell:
-    """Every node joined to four others at the corners of a tetrahedron."""
-    corners = np.array([_CORNER, *_FACE_CENTRES])
-    points = np.concatenate([corners, corners + 0.25])
-    return cell_of(points, neighbours(points, np.sqrt(3.0) / 4.0))
-
-
-def _gyroid() -> UnitCell:
-    """The net srs, (10,3)-a: nodes on one labyrinth of the gyroid, each joined to three others in a plane."""
-    # Wyckoff position 8a of the space group I4(1)32
-    first = np.array([(1, 1, 1), (3, 7, 5), (7, 5, 3), (5, 3, 7)]) / 8.0
-    points = np.concatenate([first, (first + 0.5) % 1.0])
-    return cell_of(points, neighbours(points, np.sqrt(2.0) / 4.0))
+_CORNERS_TO_FACES = [
+    [0, 1 + axis, *(-corner)]
+    for axis, (first, second) in enumerate(((1, 2), (0, 2), (0, 1)))
+    for corner in (_unit(), _unit(first), _unit(second), _unit(first, second))
+]
+_BETWEEN_FACES = [
+    [1 + one, 1 + two, *(b - a)]
+    for one, two in ((0, 1), (0, 2), (1, 2))
+    for a in (_unit(), _unit(one))
+    for b in (_unit(), _unit(two))
+]
+_FACE_DIAGONALS = [[0, 0, *way] for a, b in ((0, 1), (0, 2), (1, 2)) for way in (_unit(a, b), _unit(b) - _unit(a))]
+_OCTAHEDRON = sorted({point for z in (0.25, 0.75) for point in itertools.permutations((0.0, z, 0.5))})
+"""Corners of truncated octahedra about the corners and the centre of the cube (tetrakaidecahedra)."""
+_DIAMOND = [tuple(np.add(point, shift)) for shift in (0.0, 0.25) for point in (_CORNER, *_FACE_CENTRES)]
+_SRS = [
+    tuple((np.array(point) / 8.0 + shift) % 1.0)
+    for shift in (0.0, 0.5)
+    for point in ((1, 1, 1), (3, 7, 5), (7, 5, 3), (5, 3, 7))
+]
+"""Wyckoff position 8a of the space group I4(1)32."""
 
 
 def auxetic(angle: float = ANGLE) -> UnitCell:
@@ -207,15 +169,34 @@ def _tetrahedral_octahedral() -> UnitCell:
     return cell_of(points, struts, groups, aspect=aspect, layers=(1, 1, 3), skin=("z",))
 
 
+_TWO = [_CORNER, (0.5, 0.5, 0.5)]
+_FOUR = [_CORNER, *_FACE_CENTRES]
+
 KINDS: dict[str, Callable[[], UnitCell]] = {
-    "cubic": _cubic,
-    "octet": _octet,
-    "bcc": _bcc,
-    "bcc_diagonals": _bcc_diagonals,
-    "fcc": _fcc,
-    "kelvin": _kelvin,
-    "diamond": _diamond,
-    "gyroid": _gyroid,
+    # edges along x, y, z, then the two diagonals of the faces normal to z, to y and to x
+    "cubic": lambda: cell_of(
+        [_CORNER], _EDGES + _FACE_DIAGONALS, {"edges": range(3), "diagonals": range(3, 9)}, item_by_item=True
+    ),
+    # struts from corners to face centres, then those of the octahedron of face centres
+    "octet": lambda: cell_of(
+        _FOUR,
+        _CORNERS_TO_FACES + _BETWEEN_FACES,
+        {"face_struts": range(12), "octahedra": range(12, 24)},
+        item_by_item=True,
+    ),
+    # cube edges along x, y, z, then the eight half diagonals
+    "bcc": lambda: cell_of(
+        _TWO, _EDGES + _HALF_DIAGONALS, {"edges": range(3), "diagonals": range(3, 11)}, item_by_item=True
+    ),
+    # the eight half diagonals
+    "bcc_diagonals": lambda: cell_of(_TWO, _HALF_DIAGONALS, {"diagonals": range(8)}),
+    # both diagonals of every face, which cross in a node
+    "fcc": lambda: cell_of(_FOUR, _CORNERS_TO_FACES, {"diagonals": range(12)}),
+    "kelvin": lambda: cell_of(_OCTAHEDRON, neighbours(_OCTAHEDRON, np.sqrt(2.0) / 4.0)),
+    # every node joined to four others at the corners of a tetrahedron
+    "diamond": lambda: cell_of(_DIAMOND, neighbours(_DIAMOND, np.sqrt(3.0) / 4.0)),
+    # the net srs, (10,3)-a: nodes on one labyrinth of the gyroid, each joined to three others in a plane
+    "gyroid": lambda: cell_of(_SRS, neighbours(_SRS, np.sqrt(2.0) / 4.0)),
     "auxetic": auxetic,
     "tetrahedral_octahedral": _tetrahedral_octahedral,
 }

@@ -33,8 +33,8 @@ class Surface:
     """(points, 3) float64 [m]."""
     triangles: np.ndarray
     """(triangles, 3) int64."""
-    layers: list[np.ndarray] = field(default_factory=list)
-    """Triangles of bodies that do not touch each other, if there are several such layers; a point is inside the surface
+    bodies: list[np.ndarray] = field(default_factory=list)
+    """Triangles of each body, with normals outwards from it as if there were no others; a point is inside the surface
     where it is inside an odd number of them."""
     warnings: list[str] = field(default_factory=list)
 
@@ -57,18 +57,18 @@ class Surface:
 
     @cached_property
     def _data(self) -> list[pyvista.PolyData]:
+        """The whole surface, then its bodies if there are several."""
         import pyvista
 
-        layers = self.layers if len(self.layers) > 1 else [self.triangles]
-        return [pyvista.PolyData.from_regular_faces(self.points, triangles) for triangles in layers]
+        bodies = self.bodies if len(self.bodies) > 1 else []
+        return [pyvista.PolyData.from_regular_faces(self.points, each) for each in (self.triangles, *bodies)]
 
     @cached_property
     def _locator(self) -> Any:
-        import pyvista
         from vtkmodules.vtkCommonDataModel import vtkStaticCellLocator
 
         locator = vtkStaticCellLocator()
-        locator.SetDataSet(pyvista.PolyData.from_regular_faces(self.points, self.triangles))
+        locator.SetDataSet(self._data[0])
         locator.BuildLocator()
         return locator
 
@@ -77,14 +77,16 @@ class Surface:
 
         Where bodies touch, the distance is that from the nearest of their surfaces.
         """
-        import pyvista
-
-        inside, nearest = np.zeros(len(points), bool), np.full(len(points), np.inf)
-        for layer in self._data if len(points) else ():
-            found = np.array(pyvista.PolyData(points).compute_implicit_distance(layer)["implicit_distance"])
-            inside ^= found < 0.0
-            nearest = np.minimum(nearest, np.abs(found))
-        return np.where(inside, -nearest, nearest)
+        whole, *bodies = self._data
+        found = _signed_distances(points, whole)
+        if not bodies:
+            return found
+        inside = np.zeros(len(points), bool)  # where bodies touch, the nearest triangle does not tell
+        for body, own in zip(bodies, self.bodies):
+            low, high = self.points[own].min(axis=(0, 1)), self.points[own].max(axis=(0, 1))
+            near = np.flatnonzero(((points >= low) & (points <= high)).all(axis=1))
+            inside[near] ^= _signed_distances(points[near], body) < 0.0
+        return np.where(inside, -np.abs(found), np.abs(found))
 
     def rough_distances(self, points: np.ndarray, spacing: float) -> np.ndarray:
         """Return signed distances (n,) [m] that are exact near the surface, and elsewhere too small, never too large.
@@ -171,6 +173,15 @@ class Surface:
         return line, np.clip(along, 0.0, 1.0)
 
 
+def _signed_distances(points: np.ndarray, body: pyvista.PolyData) -> np.ndarray:
+    """Return the distances (n,) [m] of points (n, 3) from a body: negative inside."""
+    import pyvista
+
+    if len(points) == 0:
+        return np.empty(0)
+    return np.array(pyvista.PolyData(points).compute_implicit_distance(body)["implicit_distance"])
+
+
 _SUFFIXES = (".stl", ".obj", ".ply")
 
 _MERGED = 1e-7
@@ -185,7 +196,7 @@ _FLAT = 1e-9
 
 def bodies_of(points: np.ndarray, triangles: np.ndarray, where: str) -> Surface:
     """Return the surface of the bodies of triangles, every edge of which has an even number of them: by the even-odd
-    rule outer bodies, cavities in them, bodies in these, and so on. Its layers have normals as if there were no others.
+    rule outer bodies, cavities in them, bodies in these, and so on.
 
     Raises
     ------
@@ -210,7 +221,7 @@ def bodies_of(points: np.ndarray, triangles: np.ndarray, where: str) -> Surface:
         given.append(0 if turned.any() else np.sign(volume))
     if not parts:
         return Surface(points, np.empty((0, 3), np.int64))
-    inside, touching = _nested(points, parts, where)
+    inside = _nested(points, parts, where)
     for i in np.flatnonzero(inside.any(axis=1)):
         (around,) = [j for j in np.flatnonzero(inside[i]) if inside[j].sum() == inside[i].sum() - 1]
         if given[i] == given[around] != 0:
@@ -219,18 +230,8 @@ def bodies_of(points: np.ndarray, triangles: np.ndarray, where: str) -> Surface:
             warnings.append(
                 f"the body at ({x}) in the file lies in another one of the same orientation: it is taken as {what}"
             )
-    layer = np.full(len(parts), -1)
-    for i in range(len(parts)):
-        layer[i] = np.setdiff1d(np.arange(i + 1), layer[touching[i]])[0]
-    layers = [_oriented(parts, inside, np.flatnonzero(layer == number)) for number in range(layer.max() + 1)]
-    told = [f"{where}: {text}" for text in warnings]
-    return Surface(points, _oriented(parts, inside, np.arange(len(parts))), layers, told)
-
-
-def _oriented(parts: list[np.ndarray], inside: np.ndarray, members: np.ndarray) -> np.ndarray:
-    """Return the triangles of some bodies, turned where these are cavities if there are no others."""
-    depth = inside[np.ix_(members, members)].sum(axis=1)
-    return np.concatenate([parts[i][:, ::-1] if depth[k] % 2 else parts[i] for k, i in enumerate(members)])
+    turned = [own[:, ::-1] if depth % 2 else own for own, depth in zip(parts, inside.sum(axis=1))]  # cavities
+    return Surface(points, np.concatenate(turned), parts, [f"{where}: {text}" for text in warnings])
 
 
 def _without_copies(triangles: np.ndarray) -> tuple[np.ndarray, int]:
@@ -281,12 +282,10 @@ def _connected(points: np.ndarray, triangles: np.ndarray, where: str) -> list[tu
     return [(members, turned[members]) for members in np.split(order, starts[1:])]
 
 
-def _nested(points: np.ndarray, parts: list[np.ndarray], where: str) -> tuple[np.ndarray, np.ndarray]:
-    """Return (bodies, bodies) bool: whether the first lies in the second, and whether they touch."""
+def _nested(points: np.ndarray, parts: list[np.ndarray], where: str) -> np.ndarray:
+    """Return (bodies, bodies) bool: whether the first lies in the second."""
     n = len(parts)
-    inside, touching = np.zeros((n, n), bool), np.zeros((n, n), bool)
-    if n == 1:
-        return inside, touching
+    inside = np.zeros((n, n), bool)
     corners = [points[own.ravel()] for own in parts]
     low, high = np.stack([own.min(axis=0) for own in corners]), np.stack([own.max(axis=0) for own in corners])
     close = _CLOSE * float(np.linalg.norm(high.max(axis=0) - low.min(axis=0)))
@@ -295,9 +294,7 @@ def _nested(points: np.ndarray, parts: list[np.ndarray], where: str) -> tuple[np
         near[j] = False
         surface = Surface(points, parts[j])
         for i in np.flatnonzero(near):
-            sides, touches = _sides(points, parts[i], surface, close)
-            touching[i, j] |= touches
-            touching[j, i] |= touches
+            sides = _sides(points, parts[i], surface, close)
             if len(sides) != 1:
                 a, b = (", ".join(f"{x:.6g}" for x in points[parts[k][0, 0]]) for k in (i, j))
                 raise InputError(
@@ -305,21 +302,20 @@ def _nested(points: np.ndarray, parts: list[np.ndarray], where: str) -> tuple[np
                     "unite them in the program that made it"
                 )
             inside[i, j] = sides == {-1}
-    return inside, touching
+    return inside
 
 
-def _sides(points: np.ndarray, own: np.ndarray, other: Surface, close: float) -> tuple[set[int], bool]:
-    """Return on which sides of another body the edges of one are, -1 inside and 1 outside, and whether they touch."""
+def _sides(points: np.ndarray, own: np.ndarray, other: Surface, close: float) -> set[int]:
+    """Return on which sides of another body the edges of one are, -1 inside and 1 outside."""
     edges = np.concatenate([own[:, [0, 1]], own[:, [1, 2]], own[:, [2, 0]]])
     edges = edges[edges[:, 0] < edges[:, 1]]
     ends = points[edges]
     low, high = other.bounds
     near = ((ends.min(axis=1) <= high + close) & (ends.max(axis=1) >= low - close)).all(axis=1)
     starts, stops = ends[near, 0], ends[near, 1]
-    line, span, crossed = other.pieces(starts, stops)
+    line, span, _ = other.pieces(starts, stops)
     distance = other.distances(starts[line] + span.mean(axis=1)[:, None] * (stops - starts)[line])
-    sides = set(np.sign(distance[np.abs(distance) > close]).astype(int).tolist())
-    return sides | ({1} if not near.all() else set()), bool(crossed.any() or (np.abs(distance) <= close).any())
+    return {*np.sign(distance[np.abs(distance) > close]).astype(int).tolist(), *([] if near.all() else [1])}
 
 
 def read_surface(path: Path, scale: float) -> Surface:
@@ -350,7 +346,7 @@ def read_surface(path: Path, scale: float) -> Surface:
             f"from ({a}) to ({b}) in the file; close it in the program that made it (PyVista: mesh.fill_holes(size))"
         )
     surface = bodies_of(points, triangles, where)
-    if not surface.layers:
+    if not surface.bodies:
         raise InputError(f"{where}: the surface encloses no volume")
     surface.points = scale * points
     return surface

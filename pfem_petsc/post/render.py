@@ -23,7 +23,7 @@ from .chart import opened
 from .motion import PERIOD, ModeFrames, Motion, Resampled, chosen_frames, drawn_radii, even_rows, even_times
 from .options import Options
 from .page import MARKS, ColourField, ColourScale, Heading, Page, grid
-from .scene import FEW, TUBE_LIMIT, WALL_COLOUR, Scene, Segments, Style, at_one_scale, cameras, few_threads
+from .scene import FEW, TUBE_LIMIT, WALL_COLOUR, Scene, Style, at_one_scale, cameras, few_threads, tubes
 
 if TYPE_CHECKING:
     from mpi4py import MPI

@@ -83,7 +83,9 @@ class _Watch:
         atexit.register(self._at_exit)
 
     def _uncaught(self, kind: type[BaseException], error: BaseException, trace: TracebackType | None) -> None:
-        with redirect_stderr(StringIO()) as told:  # in one piece: ranks that fail together write into one another's lines
+        with redirect_stderr(
+            StringIO()
+        ) as told:  # in one piece: ranks that fail together write into one another's lines
             self._tell(kind, error, trace)
         print(told.getvalue(), end="", file=sys.stderr, flush=True)
         if not (hasattr(sys, "ps1") or sys.flags.interactive):  # the user goes on

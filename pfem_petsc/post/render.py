@@ -229,9 +229,9 @@ class Film:
         several, columns = len(self.motions) > 1, 1
         if several:
             columns, _ = grid(len(self.motions), self._aspect(), Page.region_of(size)[2:])
-        inset = self._aspect() if self.options.inset is not None else 0.0
+        inset = self.options.inset is not None
         self._prepare(size, self._labels if several else [""], columns, inset)
-        if self.options.inset is not None:
+        if inset:
             self._page.add_insets([motion.result for motion in self.motions], self.options.inset)
 
     def frame(self, number: int) -> np.ndarray:
@@ -262,7 +262,7 @@ class Film:
             scene.close()
         self._scenes = []
 
-    def _prepare(self, size: tuple[int, int], captions: Sequence[str], columns: int, inset: float = 0.0) -> None:
+    def _prepare(self, size: tuple[int, int], captions: Sequence[str], columns: int, inset: bool = False) -> None:
         """Make page, cameras and scenes for a size in pixels and drawings with captions in columns."""
         self.close()
         options = self.options
@@ -481,18 +481,13 @@ def _figure(film: Film) -> Any:
 
     motion, colour, scale = film.motions[0], film.colours[0], film.scale
     frame, camera = motion.frames[0], cameras(film.options, motion, 1.6)[0]
-    start, now, gone = motion.start, motion.positions(frame), motion.gone(frame)
-    style = film.styles[0]
-    kind = "line" if not style.tubes else "rough" if motion.n_bars <= FEW else "prism"
+    style, gone, values = film.styles[0], motion.gone(frame), colour.values(frame)
+    left = np.full(motion.n_bars, True) if gone is None else ~gone
+    bars, shown = motion.bars[left], scale.factor * (values[motion.bars] if colour.on_nodes else values[:, None])
+    shown = np.broadcast_to(shown, motion.bars.shape)[left]
     least = next((width for most, width in _WIDTHS if motion.n_bars <= most), 1.2)
-    radius = np.zeros(motion.n_bars) if style.radius is None else style.radius
-    radius = np.maximum(radius, least * camera.half_height / 720)
-    bars = Segments(None, motion.bars, kind, colour.on_nodes)
-    steps = np.linspace(0.0, 1.0, _SHAPES if motion.n_bars <= TUBE_LIMIT else 2)
-    places = []
-    for step in steps:
-        bars.move(start + step * (now - start), radius if gone is None else np.where(gone, -1.0, radius))
-        places.append(np.asarray(bars.mesh.points).T.copy())
+    shares = np.linspace(0.0, 1.0, _SHAPES if motion.n_bars <= TUBE_LIMIT else 2)
+    shapes = [(motion.start + share * (motion.positions(frame) - motion.start))[bars] for share in shares]
     label = colour.title + (f" [{scale.unit}]" if scale.unit else "")
     low, high = scale.shown.get_clim()
     shades: dict[str, Any] = {
@@ -501,22 +496,25 @@ def _figure(film: Film) -> Any:
         "cmax": high,
         "colorbar": {"title": {"text": label.replace(" ", "<br>", 1)}, "len": 0.7, "thickness": 20},
     }
-    values = scale.factor * colour.values(frame)[bars.rows].astype(np.float32)
     look: dict[str, Any] = {"hoverinfo": "skip"}
     if style.tubes:
-        corners, trace = bars.mesh.regular_faces, plotly.Mesh3d
-        look |= dict(zip("ijk", np.concatenate([corners[:, [0, 1, 2]], corners[:, [0, 2, 3]]]).T, strict=True))
-        look |= {"intensity": values, "lighting": {"ambient": 0.8, "diffuse": 0.25, "specular": 0.0}, **shades}
+        radius = np.zeros(motion.n_bars) if style.radius is None else style.radius
+        both = np.repeat(np.maximum(radius[left], least * camera.half_height / 720)[:, None], 2, axis=1)
+        made = [tubes(lines, both, 6, False, value=shown)[0].triangulate() for lines in shapes]
+        places, trace = [np.asarray(mesh.points).T for mesh in made], plotly.Mesh3d
+        look |= dict(zip("ijk", made[0].regular_faces.T, strict=True)) | {"intensity": made[0]["value"], **shades}
+        look |= {"lighting": {"ambient": 0.8, "diffuse": 0.25, "specular": 0.0}}
     else:
         # a line ends where a number is missing
-        places = [np.insert(x.reshape(3, 2, -1).swapaxes(1, 2), 2, np.nan, axis=2).reshape(3, -1) for x in places]
-        between, trace = np.insert(values.reshape(2, -1).T, 2, 0.0, axis=1).ravel(), plotly.Scatter3d
+        places = [np.insert(lines, 2, np.nan, axis=1).reshape(-1, 3).T for lines in shapes]
+        between, trace = np.insert(shown, 2, 0.0, axis=1).ravel(), plotly.Scatter3d
         look |= {"mode": "lines", "line": {"color": between, "width": 2.0 * least, **shades}}
     traces = [dict(zip("xyz", x, strict=True)) for x in places]
     walls = [_wall(plotly, surface) for surface in motion.surfaces[frame]]
     figure = plotly.Figure([trace(**traces[-1], **look), *walls])
     figure.frames = [
-        plotly.Frame(name=f"{step:.2f}", data=[trace(**x)], traces=[0]) for step, x in zip(steps, traces, strict=True)
+        plotly.Frame(name=f"{share:.2f}", data=[trace(**shape)], traces=[0])
+        for share, shape in zip(shares, traces, strict=True)
     ]
     now = {"mode": "immediate", "frame": {"duration": 0, "redraw": True}, "transition": {"duration": 0}}
     choices = [{"label": each.name, "method": "animate", "args": [[each.name], now]} for each in figure.frames]
@@ -526,7 +524,7 @@ def _figure(film: Film) -> Any:
         margin={"l": 0, "r": 0, "t": 60, "b": 20},
         showlegend=False,
         sliders=[
-            {"active": len(steps) - 1, "steps": choices, "len": 0.5, "x": 0.03, "currentvalue": {"prefix": "shape: "}}
+            {"active": len(shares) - 1, "steps": choices, "len": 0.5, "x": 0.03, "currentvalue": {"prefix": "shape: "}}
         ],
         scene={
             "aspectmode": "data",

@@ -434,7 +434,9 @@ class Scene:
         width, radius = self.width / self.unit, None if self._radius is None else self._radius[left]
         bars = Layer(points, self._bars[left], shades, width, radius=radius)
         if self._rims:
-            self._add(bars._replace(colour=_EDGE * shades, shift=0.0 if radius is not None else -width, wider=0.0), camera)
+            self._add(
+                bars._replace(colour=_EDGE * shades, shift=0.0 if radius is not None else -width, wider=0.0), camera
+            )
             bars = bars._replace(width=_CORE * width, radius=None if radius is None else _CORE * radius)
         for layer in (bars, *layers):
             self._add(layer, camera)
@@ -496,7 +498,7 @@ class Scene:
         pixel = self.unit * camera.metres(lines.reshape(-1, 3)).reshape(-1, 2) / self.size[1]
         radius = np.maximum(layer.radius[:, None], 0.5 * layer.width * pixel) + (layer.wider or 0.0) * pixel
         many = len(self._bars) > TUBE_LIMIT
-        sides = 6 if many else 20 if len(self._bars) <= FEW else 8
+        sides = 20 if len(self._bars) <= FEW else 6
         for mesh in tubes(lines, radius, sides, not many, colour=shades):
             self._plotter.add_mesh(mesh, scalars="colour", culling=layer.wider is not None and "front", **look)
 

@@ -16,7 +16,7 @@ from pfem_petsc.output.table import Table
 from pfem_petsc.output.units import POINT
 from pfem_petsc.post.members import draw_members
 from pfem_petsc.post.motion import Actions, Motion
-from pfem_petsc.post.page import ColourScale, Page, inset_room
+from pfem_petsc.post.page import ColourScale, Page
 from pfem_petsc.post.render import Film, Options, instants
 from pfem_petsc.post.scene import Style, cameras
 
@@ -115,12 +115,10 @@ def test_length_scale_is_that_at_mid_depth(tmp_path, flying, view):
     assert min(abs(metres / (10.0 ** np.floor(np.log10(metres) + 0.02)) / k - 1.0) for k in (1, 2, 5)) < 0.02
 
 
-def test_curves_are_beside_what_is_drawn(flying):
-    """Below a wide truss, beside a tall one, and never over the drawings."""
-    assert inset_room((1000, 600), 4.0, 220) == (0, 180)
-    assert inset_room((1000, 600), 0.5, 220) == (270, 0)
-    with pytest.raises(InputError, match="inset needs tiles of 220 x 264 pixels or more, and these have 200 x 600"):
-        inset_room((200, 600), 1.0, 220)
+def test_curves_are_below_what_is_drawn(flying):
+    """Never over the drawings, and not in tiles that are too small."""
+    with pytest.raises(InputError, match="inset needs tiles of 28 x 34 pixels or more, and these have 34 x 31"):
+        Film([flying] * 12, Options(inset="kinetic_energy", size=(160, 120)), print).start((160, 120))
     for points in (np.array([1.0, 0.2, 1.0]), np.array([0.2, 1.0, 1.0])):
         result = SyntheticResult("x/result.vtkhdf", ring()[0] * points, ring()[1], walls=())
         for results in ([result], [result, flying]):

@@ -5,7 +5,6 @@ from __future__ import annotations
 import csv
 import itertools
 import os
-import textwrap
 import warnings
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
@@ -15,6 +14,7 @@ from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy as np
+from cycler import cycler
 
 from ..errors import InputError, written
 from ..output.units import TIME, Axis, common_prefix
@@ -24,7 +24,12 @@ COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#6
 
 DASHES: tuple[Any, ...] = ("-", (0, (6, 2)), (0, (2, 1.5)), (0, (7, 2, 1.5, 2)))
 
-_MARKERS = ("", "o", "s", "^", "D", "v", "P", "X")
+# the dashes of closed forms, which are black as well, come last of those without markers
+_STYLES = tuple(
+    cycler(marker=["", "o", "s", "^", "D", "v", "P", "X"])
+    * cycler(linestyle=[DASHES[k] for k in (0, 2, 3, 1)])
+    * cycler(color=COLOURS)
+)
 
 FORMATS = ("png", "svg", "pdf", "csv")
 
@@ -62,12 +67,6 @@ STYLE: dict[str, Any] = {
 
 _WIDTHS = {1: 8.6, 2: 10.4}
 """Widths of pictures by the number of columns [inch]."""
-_LETTER = 0.075
-"""Width of a letter of a note or a legend [inch]."""
-_LETTERS = 20
-"""Length of names for which legends have room in the usual width."""
-
-_POINTS = 3000  # approximate maximum number of points of a curve, more than a picture has columns
 
 
 class Curve(NamedTuple):
@@ -139,14 +138,8 @@ def distinct(k: int, dash: int | None = None) -> dict[str, Any]:
     k : from 0
     dash : number of another dash, for lines that their colours tell apart
     """
-    lap, number = divmod(k, len(COLOURS))
-    # the dashes of closed forms, which are black as well, come last
-    own = (0, 2, 3, 1)[lap % len(DASHES)] if dash is None else dash
-    style = {"color": COLOURS[number], "linestyle": DASHES[own]}
-    apart = (0.012 * (k % 10), 0.12)  # shares of the picture, so that markers of curves upon each other are beside
-    marker = _MARKERS[(lap + lap // len(_MARKERS)) % len(_MARKERS)]
-    marked = {"marker": marker, "markersize": 4.5, "markevery": apart}
-    return style | (marked if lap else {})
+    marked = {"markersize": 4.5, "markevery": (0.012 * (k % 10), 0.12)}  # so that those of equal curves are apart
+    return {**_STYLES[k % len(_STYLES)], **marked} | ({} if dash is None else {"linestyle": DASHES[dash]})
 
 
 def area(k: int) -> dict[str, Any]:
@@ -265,10 +258,7 @@ class Chart:
 
         drawn = [panel for panel in panels if panel]
         heights = [max(p.height for p in panels[k : k + columns] if p) for k in range(0, len(panels), columns)]
-        names = [line for panel in drawn if panel.legend for curve in panel.curves for line in curve.name.split("\n")]
-        # long names in legends make the picture wider, and no panel narrower
-        wider = max(0.0, _LETTER * (max(map(len, names), default=0) - _LETTERS))
-        size = (_WIDTHS.get(columns, 4.4 * columns) + columns * wider, 0.9 + 2.5 * sum(heights))
+        size = _WIDTHS.get(columns, 4.4 * columns), 0.9 + 2.5 * sum(heights)
         self.figure = Figure(figsize=size, layout="constrained")
         own = any(panel.over for panel in drawn)
         grid = self.figure.subplots(
@@ -277,8 +267,7 @@ class Chart:
         self.axes = [axes for axes, panel in zip(grid.flat, panels, strict=True) if panel]
         self.figure.suptitle(literal(title), x=0.01, ha="left", fontsize=13, fontweight="bold", color="#1f242c")
         if note:
-            lines = textwrap.fill(note, int((size[0] - 0.3) / _LETTER))
-            self.figure.supxlabel(literal(lines), x=0.01, ha="left", fontsize=9, color="#5b6472")
+            self.figure.supxlabel(literal(note), x=0.01, ha="left", fontsize=9, color="#5b6472", wrap=True)
         self.time, self._axis, self._ends = np.asarray(time, dtype=float), axis, ends
         self._columns: list[tuple[str, np.ndarray, str, np.ndarray]] = []
         sizes = [(panel.unit, panel.size) for panel in drawn if panel.scale is None]
@@ -305,23 +294,19 @@ class Chart:
             place = self.time if curve.place is None else np.asarray(curve.place, dtype=float)
             values = np.asarray(curve.values, dtype=float)
             style = {"label": literal(curve.name), **curve.style}
-            if curve.kind in ("area", "band"):
-                every = max(1, len(place) // _POINTS)
-                x, y = place[::every] * along[0], values[::every] * factor
-                if curve.kind == "band":
-                    axes.fill_between(x, y[:, 0], y[:, 1], linewidth=0, **style)
-                    continue
+            x, y = place * along[0], values * factor
+            if curve.kind == "band":
+                axes.fill_between(x, *y.T, linewidth=0, **style)
+                continue
+            if curve.kind == "area":
                 axes.fill_between(x, above, above := above + np.maximum(y, 0.0), linewidth=0, **style)
-                if (y < 0.0).any():
-                    axes.fill_between(
-                        x, below, below := below + np.minimum(y, 0.0), linewidth=0, **style | {"label": None}
-                    )
+                axes.fill_between(x, below, below := below + np.minimum(y, 0.0), linewidth=0, **style | {"label": None})
             elif curve.kind.startswith("steps"):
                 side = "pre" if curve.kind == "steps before" else "post"
-                _fill_steps(axes, place * along[0], values, side, {**distinct(number), **style})
+                _fill_steps(axes, x, values, side, {**distinct(number), **style})
             else:
-                marker = "o" if len(place) == 1 else None  # a line needs two points
-                axes.plot(place * along[0], values * factor, **{"marker": marker, **distinct(number), **style})
+                point = {"marker": "o"} if len(place) == 1 else {}  # a line needs two points
+                axes.plot(x, y, **{**distinct(number), **point, **style})
             heading = f"{curve.key or curve.name} [{panel.unit}]" if panel.unit else curve.key or curve.name
             over = f"{places}: {curve.source}" if curve.source else places
             if not any(heading == other and over == before for before, _, other, _ in self._columns):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import re
 import textwrap
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
@@ -22,7 +22,6 @@ from ..output.units import engineering, prefix_for, unit_of
 from .chart import COLOURS, DASHES, REFERENCE, STYLE, Chart, Curve, Panel, area, distinct, largest, opened
 from .curves import (
     AS_COMPUTED,
-    CLOSED_FORM,
     ClosedForm,
     Filter,
     History,
@@ -496,28 +495,18 @@ def draw_curves(
         places = [_filtered(r, chosen, against, each[against]) for r, each in zip(results, found, strict=True)]
     shared = all(np.array_equal(place, places[0]) for place in places)
     over = None if against is None else (against, select(first.history, against).unit or "")
-    columns = {name: [column(result.history, name) for result in results] for name, _ in panels}
-    components = {name: _parts(found) for name, found in columns.items()}
-    split = any(len(parts) > 1 for parts in components.values())
     drawn = []
-    for (name, smoothing), caption in zip(panels, captions, strict=True):
-        found, parts, whole = columns[name], components[name], select(first.history, name)
-        curves = []
-        for number, (each, label, result, place) in enumerate(zip(found, labels, results, places, strict=True)):
-            for k, part in enumerate(parts):
-                if part not in each:
-                    continue
-                shown = _filtered(result, smoothing, part, each[part])
-                style = _line(number, k, len(results), split)
-                component = part.rpartition(".")[2] if caption else part
-                words_of = (label if len(found) > 1 else "", component if len(parts) > 1 else "")
-                key = f"{part}: {label}" if len(found) > 1 else part
-                key += f", {smoothing.name}" if smoothing is not None and (name, None) in panels else ""
-                text = " ".join(word for word in words_of if word) or caption or "computed"
-                curves.append(Curve(text, shown, style, key, place, "" if shared else label))
+    columns = [[column(result.history, name) for result in results] for name, _ in panels]
+    split = any(len(_parts(found)) > 1 for found in columns)
+    for (name, smoothing), caption, found in zip(panels, captions, columns, strict=True):
+        curves, parts, whole = [], _parts(found), select(first.history, name)
+        for number, curve in _curves_of(found, labels, caption, split):
+            key = curve.key + (f", {smoothing.name}" if smoothing is not None and (name, None) in panels else "")
+            values = _filtered(results[number], smoothing, name, curve.values)
+            source = "" if shared else labels[number]
+            curves.append(curve._replace(values=values, key=key, place=places[number], source=source))
         for known in exact_curves(exact, [part for part in parts if part in found[0]], places[0]):
-            part = known.key.removesuffix(CLOSED_FORM)
-            curves.append(known._replace(values=_filtered(first, smoothing, part, known.values)))
+            curves.append(known._replace(values=_filtered(first, smoothing, name, known.values)))
         title = parts[0] if len(parts) == 1 else name  # which component it is
         label = caption or quantity_of(name, whole)
         titles = [title] if not caption and words(title) != label else []
@@ -531,15 +520,33 @@ def draw_curves(
     return Chart(drawn, first.case.title or first.case.name, np.concatenate(times), axis, ends=ends)
 
 
+def _curves_of(
+    found: Sequence[Mapping[str, np.ndarray]], labels: Sequence[str], caption: str, split: bool
+) -> Iterator[tuple[int, Curve]]:
+    """Yield the number of a result and one of the curves that :func:`column` found in it, with its name and style.
+
+    Dashes are those of components, in charts ``split`` into them, else of a few results.
+    """
+    parts, several = _parts(found), len(found) > 1
+    for number, (columns, label) in enumerate(zip(found, labels, strict=True)):
+        for k, part in enumerate(parts):
+            if part in columns:
+                names = [label] if several else []
+                names += [part.rpartition(".")[2] if caption else part] if len(parts) > 1 else []
+                key = f"{part}: {label}" if several else part
+                dash = k if split else number if len(found) <= len(DASHES) else None
+                style = distinct(number, dash) if several else distinct(k, 0)
+                yield number, Curve(" ".join(names) or caption or "computed", columns[part], style, key)
+
+
 def _filtered(result: Any, chosen: Filter | None, name: str, values: np.ndarray) -> np.ndarray:
     """Return the values (rows,) of a column or expression after a filter, those of energies as they are."""
-    history = result.history
-    if chosen is None or _is_energy(select(history, name)):
+    history, found = result.history, select(result.history, name)
+    if chosen is None or _is_energy(found):
         return values
-    sources = select(history, name).sources
     # forces of contact are zero before the run, and so is what is computed from them, unless something is added
-    touch = all(one.startswith(("wall/", "pair/", "constraint/")) and one.endswith("/force") for one in sources)
-    before = {one: np.zeros_like(history[one][:1]) for one in sources if touch}
+    touch = all(one.startswith(("wall/", "pair/", "constraint/")) and one.endswith("/force") for one in found.sources)
+    before = {one: np.zeros_like(history[one][:1]) for one in found.sources if touch}
     return smoothed(result, chosen, values, touch and not np.any(select(before, name).values))
 
 
@@ -561,16 +568,6 @@ def _parts(found: Sequence[Mapping[str, np.ndarray]]) -> list[str]:
     there."""
     parts = list(dict.fromkeys(part for curves in found for part in curves))
     return [part for part in parts if any(np.any(curves.get(part, 0.0)) for curves in found)] or parts
-
-
-def _line(number: int, part: int, results: int, split: bool) -> dict[str, Any]:
-    """Return the style of a curve: a result has its colour in all panels.
-
-    Dashes are those of components, in charts ``split`` into them, else of a few results.
-    """
-    if results == 1:
-        return distinct(part, 0)
-    return distinct(number, part if split else number if results <= len(DASHES) else None)
 
 
 def _labels_and_captions(
@@ -674,24 +671,20 @@ def draw_spectra(
     split = any(len(_parts(found)) > 1 for found in columns)
     panels = []
     for name, caption, found in zip(names, captions, columns, strict=True):
-        whole, parts = select(first.history, name), _parts(found)
-        unit = whole.unit or ""
-        curves = []
-        for number, (label, result) in enumerate(zip(labels, results, strict=True)):
-            time = read(result.history, "time")
-            rows = max(result.stretches, key=lambda rows, time=time: float(np.ptp(time[rows])))
-            for part in (part for part in parts if part in found[number]):
-                key = f"{part}: {label}" if len(results) > 1 else part
-                frequency, amplitude = amplitude_spectrum(time[rows], found[number][part][rows], window)
-                style = _line(number, parts.index(part), len(results), split)
-                curves.append(Curve(key, amplitude, style, place=frequency))
+        whole, curves = select(first.history, name), []
+        for number, curve in _curves_of(found, labels, caption, split):
+            time = read(results[number].history, "time")
+            rows = max(results[number].stretches, key=lambda rows, time=time: float(np.ptp(time[rows])))
+            frequency, amplitude = amplitude_spectrum(time[rows], curve.values[rows], window)
+            curves.append(curve._replace(values=amplitude, place=frequency))
         label = f"amplitude of\n{caption or quantity_of(name, whole)}"
-        legend, title = len(curves) > 1, f"window: {window}" if caption else f"{name}, window: {window}"
+        title = f"window: {window}" if caption else f"{name}, window: {window}"
         along = prefix_for(highest or max(curve.place[-1] for curve in curves), "Hz")
-        over, scale = ("frequency", "Hz"), (1.0, unit)
-        panels.append(Panel(label, unit, curves, title, 1.1, over, scale, legend, True, along))
-    title = first.case.title or first.case.name
-    chart = Chart(panels, title, np.zeros(1))
+        scale = (1.0, whole.unit or "")
+        panels.append(
+            Panel(label, scale[1], curves, title, 1.1, ("frequency", "Hz"), scale, len(curves) > 1, True, along)
+        )
+    chart = Chart(panels, first.case.title or first.case.name, np.zeros(1))
     for axes, panel in zip(chart.axes, panels, strict=True):
         factor, shown = panel.along
         end = highest or max(curve.place[-1] for curve in panel.curves)

@@ -15,7 +15,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -382,6 +381,7 @@ def draw_members(
         If no member has a utilisation, there are too many cases, or the picture cannot be made.
     """
     from .chart import opened
+    from .motion import Frames
     from .options import Options
     from .render import Film, save
 
@@ -407,13 +407,8 @@ def draw_members(
         names = [stage.name for stage in result.case.stage]
         order = sorted(range(len(cases)), key=lambda k: names.index(cases[k]) if cases[k] in names else 0)
         # the first snapshot, with the utilisations as its field, once for each case
-        drawn = SimpleNamespace(
-            path=result.path,
-            case=result.case,
-            bars=result.bars,
-            bar_data=result.bar_data,
-            axis=result.axis,
-            history=result.history,
+        drawn = Frames(
+            result,
             times=np.repeat(result.times[:1], len(cases)),
             positions=lambda snapshot: result.positions(0),
             point_fields=(),

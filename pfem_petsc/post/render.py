@@ -20,7 +20,7 @@ from ..output.result import stage_at
 from ..parallel.agreement import agreed
 from ..signals import launched_rank
 from .chart import opened
-from .motion import PERIOD, ModeFrames, Motion, Resampled, chosen_frames, drawn_radii, even_rows, even_times
+from .motion import PERIOD, Motion, chosen_frames, drawn_radii, even_rows, even_times, mode_frames, resampled
 from .options import Options
 from .page import MARKS, ColourField, ColourScale, Heading, Page, grid
 from .scene import FEW, TUBE_LIMIT, WALL_COLOUR, Scene, Style, at_one_scale, cameras, few_threads, tubes
@@ -157,7 +157,7 @@ def render_modes(
         As ``render``, and where the result has no such modes.
     """
     with opened(result_path) as result:
-        frames = ModeFrames(result, modes, period)
+        frames = mode_frames(result, modes, period)
         folder = Path(output) if output is not None else Path(result.path).parent / "modes"
         count = len(frames.times)
         return render(frames, folder, field="amplitude", frames=count, **{"clim": (0.0, 1.0)} | options)
@@ -333,9 +333,9 @@ def _timed(results: Sequence[Any], options: Options, note: Callable[[str], None]
         if options.frames is not None:
             raise InputError("render: frames and rate both choose the frames; give one of the two")
         times = even_times(times, options.rate, options.span)
-        return [Resampled(result, times) for result in results], list(range(len(times)))
+        return [resampled(result, times) for result in results], list(range(len(times)))
     chosen = chosen_frames(options.frames, times, note, options.span)
-    return [results[0], *(Resampled(result, times) for result in results[1:])], chosen
+    return [results[0], *(resampled(result, times) for result in results[1:])], chosen
 
 
 def instants(result: Any, frames: Sequence[int], count: int) -> list[int]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import math
 import os
 import subprocess
 import sys
@@ -290,7 +291,7 @@ def tubes(
 
     places = lines.reshape(-1, 3).astype(np.float32)
     data = {name: np.ascontiguousarray(each).reshape(2 * len(lines), -1) for name, each in values.items()}
-    data["radius"] = radius.ravel()
+    data["radius"] = radius.ravel() / math.sqrt(math.cos(math.pi / sides))  # as wide as round ones in the mean
     cells = pyvista.CellArray.from_regular_cells(np.arange(len(places)).reshape(-1, 2))
     mesh = pyvista.PolyData(places, lines=cells)
     mesh.point_data.update(data)
@@ -498,7 +499,7 @@ class Scene:
         pixel = self.unit * camera.metres(lines.reshape(-1, 3)).reshape(-1, 2) / self.size[1]
         radius = np.maximum(layer.radius[:, None], 0.5 * layer.width * pixel) + (layer.wider or 0.0) * pixel
         many = len(self._bars) > TUBE_LIMIT
-        sides = 20 if len(self._bars) <= FEW else 6
+        sides = 20 if len(self._bars) <= FEW else 8
         for mesh in tubes(lines, radius, sides, not many, colour=shades):
             self._plotter.add_mesh(mesh, scalars="colour", culling=layer.wider is not None and "front", **look)
 

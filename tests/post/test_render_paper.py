@@ -293,8 +293,8 @@ def test_many_loads_are_thinned_and_counted(tmp_path):
         actions = Actions(result, ["loads"], result.times[:1], bounds)
         tips = actions.arrows(0, points)[1]
         assert actions.notes == [f"symbols at {len(tips)} of 441 loaded nodes"] and 20 <= len(tips) <= 40
-        # as many in each half, and no node farther from one than the diagonal of a cell of 1/5 and half a mesh
-        assert all(np.sum(tips[:, k] < 0.499) == np.sum(tips[:, k] > 0.501) for k in (0, 1))
+        # nearly as many in each half, and no node farther from one than the diagonal of a cell of 1/5 and half a mesh
+        assert all(abs(np.sum(tips[:, k] < 0.499) - np.sum(tips[:, k] > 0.501)) <= 4 for k in (0, 1))
         assert np.linalg.norm(points[:, None] - tips, axis=2).min(axis=1).max() < np.sqrt(2.0) * (0.2 + 0.025)
 
 

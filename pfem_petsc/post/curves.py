@@ -353,20 +353,16 @@ def window_mean(time: np.ndarray, values: np.ndarray, width: float, zero_before:
     It depends on past values only. The integral is exact for any spacing of the points. At the start, the window is
     truncated, unless the curve is zero before it: a spike in the first row would be its own mean.
     """
-    if len(time) < 2 or width <= 0:
+    if len(time) < 2 or width <= 0.0:
         return values.copy()
-    steps = np.diff(time)
-    integral = np.concatenate([[0.0], np.cumsum(0.5 * steps * (values[1:] + values[:-1]))])
+    from scipy.interpolate import BSpline
+
+    knots = np.concatenate([time[:1], time, time[-1:]])  # of a piecewise linear curve, which may jump
+    integral = BSpline(knots, values, 1).antiderivative()
     low = np.maximum(time - width, time[0])
-
-    def primitive(at: np.ndarray) -> np.ndarray:
-        k = np.clip(np.searchsorted(time, at, side="right") - 1, 0, len(steps) - 1)
-        part = at - time[k]
-        slope = (values[k + 1] - values[k]) / np.where(steps[k] > 0, steps[k], 1.0)
-        return integral[k] + part * (values[k] + 0.5 * slope * part)
-
     span = np.full(len(time), width) if zero_before else time - low
-    return np.where(span > 0.0, (integral - primitive(low)) / np.where(span > 0.0, span, 1.0), values)
+    change = integral(time) - integral(low)
+    return np.divide(change, span, out=np.array(values, dtype=float), where=span > 0.0)
 
 
 def cfc(time: np.ndarray, values: np.ndarray, size: float, zero_before: bool = False) -> np.ndarray:

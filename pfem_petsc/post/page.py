@@ -475,7 +475,7 @@ def mesh_page(mesh: WholeMesh, size: tuple[int, int] = (1280, 720), view: str = 
     wide, high = axes.bbox.size.astype(int).tolist()
     camera = fit(points, direction(view, bounds, [], (0.0, 0.0, 1.0)), wide / high)
     motion = SimpleNamespace(start=points, bars=mesh.bars, bounds=bounds)
-    scene = Scene(motion, camera, (wide, high), Style(tubes=False, rims=False), unit=_unit_of(size))
+    scene = Scene(motion, camera, (wide, high), Style(rims=False), unit=_unit_of(size))
     picture = scene.draw(points, (255.0 * palette[group]).astype(np.uint8), camera)
     scene.close()
     figure.figimage(picture, *axes.bbox.min.round(), origin="upper")

@@ -52,9 +52,9 @@ _ENCODERS = {
 
 def _style(options: Options, result: Any, note: Callable[[str], None]) -> Style:
     """Return how the bars of a result are drawn."""
-    tubes = len(result.bars) <= TUBE_LIMIT if options.style == "auto" else options.style == "tubes"
+    tubes = options.style == "tubes" or (options.style == "auto" and len(result.bars) <= TUBE_LIMIT)
     radius = drawn_radii(result, note if options.style == "tubes" else None) if tubes else None
-    return Style(tubes, None if radius is None else options.radius_scale * radius, options.bar_width, options.nodes)
+    return Style(None if radius is None else options.radius_scale * radius, options.bar_width, options.nodes)
 
 
 def render(
@@ -88,9 +88,8 @@ def render(
     from mpi4py import MPI
 
     comm = comm or MPI.COMM_SELF
-    first = comm.rank == 0
+    first, chosen = comm.rank == 0, Options(**options)
     tell = note if first else _nothing
-    chosen = Options(**options)
     paths = list(result_path) if isinstance(result_path, (list, tuple)) else [result_path]
     with ExitStack() as stack:
         results = [stack.enter_context(opened(each)) for each in paths]
@@ -195,8 +194,7 @@ class Film:
         self.motions = [Motion(result, chosen, options, note) for result in shown]
         self.styles = [_style(options, result, note) for result in results]
         for motion, style in zip(self.motions, self.styles, strict=True):
-            if style.radius is not None and len(style.radius):
-                motion.reach = max(motion.reach, float(style.radius.max()))
+            motion.reach = max(motion.reach, 0.0 if style.radius is None else float(style.radius.max(initial=0.0)))
         case = results[0].case
         self.title = options.title if options.title is not None else (case.title or case.name)
         self._scenes: list[Scene] = []
@@ -497,9 +495,8 @@ def _figure(film: Film) -> Any:
         "colorbar": {"title": {"text": label.replace(" ", "<br>", 1)}, "len": 0.7, "thickness": 20},
     }
     look: dict[str, Any] = {"hoverinfo": "skip"}
-    if style.tubes:
-        radius = np.zeros(motion.n_bars) if style.radius is None else style.radius
-        both = np.repeat(np.maximum(radius[left], least * camera.half_height / 720)[:, None], 2, axis=1)
+    if style.radius is not None:
+        both = np.repeat(np.maximum(style.radius[left], least * camera.half_height / 720)[:, None], 2, axis=1)
         made = [tubes(lines, both, 6, False, value=shown)[0].triangulate() for lines in shapes]
         places, trace = [np.asarray(mesh.points).T for mesh in made], plotly.Mesh3d
         look |= dict(zip("ijk", made[0].regular_faces.T, strict=True)) | {"intensity": made[0]["value"], **shades}

@@ -312,14 +312,12 @@ class Style:
 
     Parameters
     ----------
-    tubes : whether bars have the radii of their sections
-    radius : (b,) [m] of the bars; None: not known
-    bar_width : of bars without radii, and the least width of tubes, in pixels; None: by the size of the model
+    radius : (b,) [m] of tubes; None: bars are lines
+    bar_width : of lines, and the least width of tubes, in pixels; None: by the size of the model
     nodes : whether to draw nodes as balls; None: for small models
     rims : whether bars that are wide enough have dark rims
     """
 
-    tubes: bool
     radius: np.ndarray | None = field(default=None, repr=False)
     bar_width: float | None = None
     nodes: bool | None = None
@@ -384,7 +382,7 @@ class Scene:
         lengths = pixels * np.linalg.norm(np.diff(motion.start[self._bars], axis=1)[:, 0], axis=1)
         shortest = float(np.quantile(lengths, 0.1)) if count else 1.0
         self.width = style.bar_width or _width(count, lengths, shortest, unit)
-        self._radius = style.radius if style.tubes else None
+        self._radius = style.radius
         self._corners = np.array(np.meshgrid(*motion.bounds.T)).reshape(3, -1).T
         self._plotter = pyvista.Plotter(
             off_screen=True, window_size=[side * self._factor for side in size], lighting="none"

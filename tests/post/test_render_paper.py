@@ -38,7 +38,7 @@ def test_bars_have_the_colours_of_the_scale_wherever_they_are(view, count):
         [[-0.8, 0.6, 0.9], [0.8, 0.6, 0.9], [-0.8, 0.0, -0.9], [0.8, 0.0, -0.9], [-0.8, -0.6, -0.4], [0.8, -0.6, 0.4]]
     )
     bars = np.repeat([[0, 1], [2, 3], [4, 5]], count, axis=0)
-    camera, style = camera_of(BOX, view), Style(True, np.full(len(bars), 0.1), nodes=False)
+    camera, style = camera_of(BOX, view), Style(np.full(len(bars), 0.1), nodes=False)
     picture = picture_of(points, bars, np.repeat(colours, count, axis=0), camera, (300, 300), style)
     x, y, _ = projected(camera, points.reshape(3, 2, 3).mean(axis=1), (300, 300))
     for column, row, colour in zip(x.round().astype(int), y.round().astype(int), colours, strict=True):
@@ -50,7 +50,7 @@ def test_bars_have_the_colours_of_the_scale_wherever_they_are(view, count):
 
 def test_rims_leave_thin_bars_their_colour():
     """A bar four pixels wide: its darkest pixel across is at least 70 % of its colour, and crossing bars have edges."""
-    points, style = np.array([[-0.8, 0.0, 0.0], [0.8, 0.0, 0.0]]), Style(False, bar_width=4.0, nodes=False)
+    points, style = np.array([[-0.8, 0.0, 0.0], [0.8, 0.0, 0.0]]), Style(bar_width=4.0, nodes=False)
     picture = picture_of(points, [[0, 1]], [(200, 100, 100)], camera_of(BOX, "xy"), (300, 300), style)
     across = picture[140:160, 150, 0]
     assert (across == 200).any()

@@ -78,8 +78,6 @@ class Motion:
         self.times = np.asarray(result.times, dtype=float)[self.frames]
         self.n_bars = len(self.bars)
         for mark in options.marks:
-            if mark not in MARKS:
-                raise InputError(f"render: mark = {mark!r} is not known; it is one of {', '.join(MARKS)}")
             if MARKS[mark].field not in result.cell_fields:
                 raise InputError(
                     f"render: mark = {mark!r}: the result holds no field '{MARKS[mark].field}'; "
@@ -88,10 +86,9 @@ class Motion:
         self._trails = {name: self._probe_rows(name) for name in options.trails}
         self.reach, self.hulls = 0.0, [_outermost(self._held(frame)) for frame in self.frames]
         self.boxes = np.array([[points.min(axis=0), points.max(axis=0)] for points in self.hulls])
-        low, high = self.boxes[:, 0].min(axis=0), self.boxes[:, 1].max(axis=0)
-        if options.ghost:
-            low, high = np.fmin(low, self.start.min(axis=0)), np.fmax(high, self.start.max(axis=0))
-        self.bounds = np.array([low, high])
+        self._ghost = [_outermost(self.start)] if options.ghost else []
+        seen = np.concatenate([*self.hulls, *self._ghost])
+        self.bounds = np.array([seen.min(axis=0), seen.max(axis=0)])
         self.actions = Actions(result, options.show, self.times, self.bounds) if options.show else None
         if self.actions is not None:
             for k, frame in enumerate(self.frames):
@@ -102,8 +99,6 @@ class Motion:
         self.surfaces = self._moved(walls)
         self.normals = [wall.normal / np.linalg.norm(wall.normal) for wall in walls if hasattr(wall, "normal")]
         every = np.asarray(result.times, dtype=float)
-        known = result.axis is POINT and "load_factor" in result.history
-        self._factors = [np.asarray(result.history[name]) for name in ("time", "load_factor")] if known else []
         self.time_factor, self.time_unit = result.axis.scale(float(np.abs(every).max()))
         steps = np.diff(np.unique(self.time_factor * every))
         self._decimals = int(np.clip(np.ceil(0.3 - np.log10(np.median(steps))), 0, 6)) if len(steps) else 2
@@ -123,25 +118,21 @@ class Motion:
             if walls[k].type == "plane" and not turned:  # which is drawn beside the structure, wherever it is
                 normal = np.asarray(walls[k].normal) / np.linalg.norm(walls[k].normal)
                 shift = (shift @ normal) * normal
-            if surface is not None:
-                moved = replace(surface, points=surface.points + shift) if shift.any() and not turned else surface
-                if turned:
-                    centre = _place(walls[k])
-                    moved = replace(surface, points=(surface.points - centre) @ turn.T + centre + shift)
-                surfaces[self.frames[row]].append(moved)
+            if surface is not None and (turned or shift.any()):
+                centre = _place(walls[k])
+                surface = replace(surface, points=(surface.points - centre) @ turn.T + centre + shift)
+            surfaces[self.frames[row]] += [] if surface is None else [surface]
         return surfaces
 
     @property
     def surroundings(self) -> np.ndarray:
         """Points (n, 3) [m] that the camera has in view: the motion, and walls near it."""
-        near = self.hulls + ([_outermost(self.start)] if self._options.ghost else [])
+        near = [*self.hulls, *self._ghost]
         size = float(np.linalg.norm(self.bounds[1] - self.bounds[0])) or 1.0
-        drawn = {id(surface): surface.points for each in self.surfaces.values() for surface in each}
-        for points in drawn.values():
+        for points in {id(wall): wall.points for walls in self.surfaces.values() for wall in walls}.values():
             # a distant wall would shrink the structure to a dot: it is drawn but does not affect the view
             gap = np.maximum(points.min(axis=0) - self.bounds[1], self.bounds[0] - points.max(axis=0))
-            if gap.max() < 0.6 * size:
-                near.append(points)
+            near += [points] if gap.max() < 0.6 * size else []
         return np.concatenate(near)
 
     @property
@@ -166,18 +157,16 @@ class Motion:
         points = np.asarray(self.result.positions(frame), dtype=float)
         return points if self.scale == 1.0 else self.start + self.scale * (points - self.start)
 
-    def gone(self, frame: int) -> np.ndarray | None:
-        """Return the bars (b,) that have left the model, None if the result does not tell."""
+    def whole(self, frame: int) -> np.ndarray:
+        """Return which bars (b,) have not left the model; all if the result does not tell."""
         if "status" not in self.result.cell_fields:
-            return None
-        return np.asarray(self.result.field("status", frame)) == STATUS.index("broken")
+            return np.full(self.n_bars, True)
+        return np.asarray(self.result.field("status", frame)) != STATUS.index("broken")
 
     def _held(self, frame: int) -> np.ndarray:
         """Return the positions of nodes with bars: others may fly far away, and would shrink the picture."""
-        points, gone = self.positions(frame), self.gone(frame)
-        if gone is None or gone.all():
-            return points
-        return points[np.unique(self.bars[~gone])]
+        points, whole = self.positions(frame), self.whole(frame)
+        return points[np.unique(self.bars[whole])] if whole.any() else points
 
     def time(self, frame: int) -> str:
         """The heading of a frame."""
@@ -186,8 +175,10 @@ class Motion:
         axis, time = self.result.axis, self.result.times[frame]
         if axis.staged:
             return self.result.place(time)
+        if axis is POINT and "load_factor" in (history := self.result.history):
+            return f"{axis.place(time)}, load factor {np.interp(time, history['time'], history['load_factor']):.4g}"
         if not axis.unit:
-            return axis.place(time) + (f", load factor {np.interp(time, *self._factors):.4g}" if self._factors else "")
+            return axis.place(time)
         return f"{axis.symbol} = {time * self.time_factor:.{self._decimals}f} {self.time_unit}"
 
     def probe(self, name: str) -> np.ndarray:
@@ -208,16 +199,14 @@ class Motion:
     def layers(self, frame: int, scene: Scene, camera: Camera) -> list[Layer]:
         """Return what is drawn in addition to the bars of a frame."""
         made, points, thick = [], self.positions(frame), scene.thickness(camera)
-        width, gone = scene.width / scene.unit, self.gone(frame)
+        width, whole = scene.width / scene.unit, self.whole(frame)
         if self._options.ghost:
             made.append(Layer(self.start, self.bars, GHOST, float(np.clip(0.6 * width, 1.2, 2.4)), -thick))
         if "yielded" in self._options.marks:
             yielded = np.asarray(self.result.field("plastic_strain", frame)) != 0.0
-            if gone is not None:
-                yielded &= ~gone
-            made.append(scene.rim(points, np.flatnonzero(yielded), MARKS["yielded"].colour))
-        if "broken" in self._options.marks and gone is not None:
-            made.append(self._stubs(points, gone, width))
+            made.append(scene.rim(points, np.flatnonzero(yielded & whole), MARKS["yielded"].colour))
+        if "broken" in self._options.marks:
+            made.append(self._stubs(points, ~whole, width))
         if self.actions is not None:
             made += self.actions.layers(self.frames.index(frame), points, camera)
         for number, (when, places) in enumerate(self._trails.values()):

@@ -284,8 +284,7 @@ class Film:
         motion, colour, scene, camera = self.motions[k], self.colours[k], self._scenes[k], self._cameras[k][number]
         frame = motion.frames[number]
         shades, layers = self.scale.colours(colour.values(frame)), motion.layers(frame, scene, camera)
-        surfaces, gone = motion.surfaces[frame], motion.gone(frame)
-        return scene.draw(motion.positions(frame), shades, camera, surfaces, gone, layers)
+        return scene.draw(motion.positions(frame), shades, camera, motion.surfaces[frame], motion.whole(frame), layers)
 
     def _acting(self, numbers: Sequence[int]) -> tuple[list[dict[str, np.ndarray]], list[str]]:
         """Return the directions of gravity and wind in each drawing of frames, and what is told of its loads."""
@@ -479,8 +478,7 @@ def _figure(film: Film) -> Any:
 
     motion, colour, scale = film.motions[0], film.colours[0], film.scale
     frame, camera = motion.frames[0], cameras(film.options, motion, 1.6)[0]
-    style, gone, values = film.styles[0], motion.gone(frame), colour.values(frame)
-    left = np.full(motion.n_bars, True) if gone is None else ~gone
+    style, left, values = film.styles[0], motion.whole(frame), colour.values(frame)
     bars, shown = motion.bars[left], scale.factor * (values[motion.bars] if colour.on_nodes else values[:, None])
     shown = np.broadcast_to(shown, motion.bars.shape)[left]
     least = next((width for most, width in _WIDTHS if motion.n_bars <= most), 1.2)

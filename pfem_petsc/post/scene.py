@@ -407,7 +407,7 @@ class Scene:
         colours: np.ndarray,
         camera: Camera,
         surfaces: Sequence[Surface] = (),
-        gone: np.ndarray | None = None,
+        whole: np.ndarray | None = None,
         layers: Sequence[Layer] = (),
     ) -> np.ndarray:
         """Draw a frame.
@@ -418,7 +418,7 @@ class Scene:
         colours : (n, 3) or (b, 3) uint8
         camera : of this frame
         surfaces : walls
-        gone : (b,) bool, bars that are left out
+        whole : (b,) bool, bars that are drawn; None: all
         layers : lines in addition to the bars
 
         Returns
@@ -428,7 +428,7 @@ class Scene:
         from PIL import Image
 
         self._plotter.clear_actors()
-        left = np.full(len(self._bars), True) if gone is None else ~gone
+        left = slice(None) if whole is None else whole
         shades = colours[self._bars[left]] if self._on_nodes else colours[left, None]
         width, radius = self.width / self.unit, None if self._radius is None else self._radius[left]
         bars = Layer(points, self._bars[left], shades, width, radius=radius)

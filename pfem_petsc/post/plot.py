@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.ndimage import binary_dilation
 
 from ..case.base import StrictModel
 from ..columns import SUPPLIED
@@ -71,11 +72,6 @@ WINDOW = 0.02  # width of the moving average of forces, relative to the run
 
 _ROUNDING = 1e-9
 """Change of a curve below which it is constant, relative to the largest number of its unit in the picture."""
-
-_MOMENTA = ("momentum", "angular_momentum")
-
-_QUANTITIES = ("displacement", "velocity", "reaction")
-"""Of probes that have panels; accelerations in impacts are mostly noise."""
 
 
 def plot(result_path: Path | str | Any | Sequence[Any], output: Path | str | None = None, **options: Any) -> list[Path]:
@@ -150,9 +146,9 @@ def _usual(
     forces = chosen or _usual_filter(result)
     drawn = {
         "energies": energies(history, exact),
-        "momentum": momentum(history, exact) if result.stretches else ([], "", 1),
-        "probes": probes(history, exact),
-        "bars": bars(history),
+        "momentum": momentum(result, exact) if result.stretches else ([], "", 1),
+        "probes": probes(result, exact),
+        "bars": bars(result),
         "walls": force_panels(result, "wall", forces, exact),
         "pairs": force_panels(result, "pair", forces),
         "constraints": force_panels(result, "constraint", forces),
@@ -206,9 +202,8 @@ def energies(history: History, exact: ClosedForm | None = None) -> tuple[list[Pa
     lines = [Curve(words(name), values, distinct(number[name]), name) for name, values in moving.items()]
     lines += exact_curves(exact, list(moving))
     # a share of the largest energy, so that neither a prefix nor a unit hides how small it is
-    worst = float(np.nanmax(np.abs(error))) / (most or 1.0)
-    told = f"at most {worst:.1e}\nof {engineering(most, 'J')}" if worst > 0.0 else "zero"
-    share = (1.0 / most, "") if most > 0.0 else (1.0, "J")
+    share, worst = (1.0 / (most or 1.0), ""), float(np.nanmax(np.abs(error)))
+    told = f"at most {worst * share[0]:.1e}\nof {engineering(most, 'J')}" if worst > 0.0 else "zero"
     balance = Curve(told, error, {"color": COLOURS[1]}, "balance error")
     panels = [
         Panel("stored and lost,\nstacked", "J", [*areas, *sums], "", 1.3),
@@ -218,97 +213,64 @@ def energies(history: History, exact: ClosedForm | None = None) -> tuple[list[Pa
     return panels, f"Zero throughout: {', '.join(still)}." if still else "", 1
 
 
-def momentum(history: History, exact: ClosedForm | None = None) -> tuple[list[Panel], str, int]:
+def momentum(result: Any, exact: ClosedForm | None = None) -> tuple[list[Panel], str, int]:
     """Momentum, angular momentum and the displacement of the centre of mass, without those that do not change."""
-    panels = {words(name): _vector(history, name, words(name), exact) for name in _MOMENTA if name in history}
+    history, scales = result.history, {}
+    names = {words(name): name for name in ("momentum", "angular_momentum") if name in history}
     if "centre_of_mass" in history:
-        label = "centre of mass,\nmoved by"
-        panels[label] = _vector(history, "centre_of_mass/displacement", label, exact)
-    scales = {}
-    if len(panels) == 3:
+        names["displacement of the centre of mass"] = "centre_of_mass/displacement"
+    if len(names) == 3:
         arm = np.linalg.norm(read(history, "centre_of_mass"), axis=1)
         scales["angular momentum"] = largest(arm * np.linalg.norm(read(history, "momentum"), axis=1))
-    shown, note = _moving(panels, scales)
+    shown, note = _moving(result, names, scales, exact)
     return (shown if any(panel.size > 0.0 for panel in shown) else []), note, 1
 
 
-def probes(history: History, exact: ClosedForm | None = None) -> tuple[list[Panel | None], str, int]:
-    """Displacement, velocity and reaction of each probe, a row each, without those that do not change."""
-    found = {name.removeprefix("probe/").rpartition("/")[0]: None for name in history if name.startswith("probe/")}
-    panels, scales = {}, {}
-    for probe, quantity in itertools.product(found, _QUANTITIES):
-        source = f"probe/{probe}/{'position' if quantity == 'displacement' else quantity}"
-        if source not in history:
-            continue
-        key, values = f"{quantity} of {probe}", read(history, source)
-        count = values.shape[1]
-        panel = _vector(history, f"probe/{probe}/{quantity}", quantity, exact)
-        panel.title = f"{probe}, {'sum' if quantity == 'reaction' else 'mean'} of {count} nodes" if count > 1 else probe
-        if quantity == "displacement":
-            scales[key] = 1e-3 * largest(values)
-            values = values - values[:1]
-        if count > 1 and quantity != "reaction":
-            for curve in list(panel.curves)[: len(column(history, f"probe/{probe}/{quantity}"))]:
-                part = values[:, :, "xyz".index(curve.name)]
-                bounds = np.stack([part.min(axis=1), part.max(axis=1)], axis=1)
-                panel.curves.append(Curve("", bounds, {"color": curve.style["color"], "alpha": 0.15}, kind="band"))
-        panels[key] = panel
-    shown, note = _moving(panels, scales)
-    if any(curve.kind == "band" for panel in shown for curve in panel.curves):
-        note = f"Shaded: the range of the nodes. {note}".strip()
-    if len(found) < 2 or len(shown) < 3:
-        return shown, note, 1
-    keys = {(panel.title.partition(",")[0], panel.label): panel for panel in shown}
-    rows, columns = (list(dict.fromkeys(names)) for names in zip(*keys, strict=True))
-    return [keys.get(place) for place in itertools.product(rows, columns)], note, len(columns)
+def probes(result: Any, exact: ClosedForm | None = None) -> tuple[list[Panel], str, int]:
+    """Displacement, velocity and reaction of each probe, without those that do not change."""
+    names, scales = {}, {}
+    for source in result.history:
+        probe, _, quantity = source.removeprefix("probe/").rpartition("/")
+        if source.startswith("probe/") and quantity in ("position", "velocity", "reaction"):
+            name = f"{'displacement' if quantity == 'position' else quantity} of {probe}"
+            names[name] = source.replace("/position", "/displacement")
+            scales[name] = 1e-3 * largest(read(result.history, source)) if quantity == "position" else 0.0
+    return *_moving(result, names, scales, exact), 1
 
 
-def bars(history: History) -> tuple[list[Panel], str, int]:
+def bars(result: Any) -> tuple[list[Panel], str, int]:
     """Axial force and stress of the bars of each probe."""
-    panels = []
-    names = [name for name in history if name.startswith("bar/") and not name.endswith("/strain")]
-    for name in names:
-        probe, quantity = name.removeprefix("bar/").rsplit("/", 1)
-        values = read(history, name)
-        title, bounds = probe, np.stack([values.min(axis=1), values.max(axis=1)], axis=1)
-        curves = [Curve("", values.mean(axis=1), {"color": COLOURS[0]}, name)]
-        if values.shape[1] > 1:
-            title = f"{probe}, mean of {values.shape[1]} bars"
-            curves.append(Curve("", bounds, {"color": COLOURS[0], "alpha": 0.15}, kind="band"))
-        panels.append(Panel(words(quantity), unit_of(name), curves, title, 0.9, legend=False))
-    several = any(len(panel.curves) > 1 for panel in panels)
-    return panels, "Shaded: the range of the bars." if several else "", 2
+    names = [name for name in result.history if name.startswith("bar/") and not name.endswith("/strain")]
+    panels = curve_panels([result], [(name, None) for name in names])
+    return panels, _SHADED if any(len(panel.curves) > 1 for panel in panels) else "", 2
 
 
-def _vector(history: History, name: str, label: str, exact: ClosedForm | None) -> Panel:
-    """Return the panel of the components of a column that are not zero."""
-    curves = [
-        Curve(part[-1], values, {"color": COLOURS["xyz".index(part[-1])]}, part)
-        for part, values in column(history, name).items()
-    ]
-    curves += exact_curves(exact, [curve.key for curve in curves])
-    return Panel(label, unit_of("position" if "displacement" in name else name), curves)
+_SHADED = "Shaded: the range of the nodes or bars."
 
 
-def _moving(panels: dict[str, Panel], scales: dict[str, float]) -> tuple[list[Panel], str]:
-    """Return the panels whose curves change, or all if none does, and a note that names the others.
+def _moving(
+    result: Any, names: Mapping[str, str], scales: Mapping[str, float], exact: ClosedForm | None
+) -> tuple[list[Panel], str]:
+    """Return the panels of columns that change, or of all if none does, and a note that names the others.
 
     Rounding is relative to the largest number of the unit, or to the ``scales`` of numbers that values are
     differences of.
     """
     shown, still = [], []
+    panels = dict(zip(names, curve_panels([result], [(name, None) for name in names.values()], exact), strict=True))
     for name, panel in panels.items():
         scale = max([scales.get(name, 0.0), *(other.size for other in panels.values() if other.unit == panel.unit)])
         curves = [np.nan_to_num(curve.values) for curve in panel.curves]
         if max(float(np.ptp(values, axis=0).max()) for values in curves) > _ROUNDING * scale:
             shown.append(panel)
         else:
-            means = {curve.name: float(np.mean(curve.values)) for curve in panel.curves if curve.name in tuple("xyz")}
+            means = {curve.key[-1]: float(np.mean(curve.values)) for curve in panel.curves if curve.kind == "line"}
             parts = ", ".join(f"{part} = {mean:.4g}" for part, mean in means.items() if abs(mean) > _ROUNDING * scale)
             still.append(f"{name} ({parts} {panel.unit})" if parts else f"{name} (zero)")
-    if not shown:
-        return list(panels.values()), ""
-    return shown, f"Constant: {', '.join(still)}." if still else ""
+    note = f"Constant: {', '.join(still)}." if still and shown else ""
+    shown = shown or list(panels.values())
+    shaded = any(curve.kind == "band" for panel in shown for curve in panel.curves)
+    return shown, f"{_SHADED} {note}".strip() if shaded else note
 
 
 def solver(history: History) -> list[Panel]:
@@ -424,7 +386,8 @@ def _wall_path(result: Any, wall: Any, smoothing: Filter, exact: ClosedForm | No
     def path(force: np.ndarray, moved: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return both after the filter, while nodes touch the wall."""
         smooth, moved = smoothed(result, smoothing, force, True), smoothed(result, smoothing, moved)
-        near, begin = _near(force, smooth), max(0, int(np.argmax(force != 0.0)) - 1)
+        felt = (force != 0.0) | (np.abs(smooth) > 1e-3 * largest(smooth))
+        near, begin = binary_dilation(felt), max(0, int(np.argmax(force != 0.0)) - 1)
         shown = slice(np.argmax(near), len(near) - np.argmax(near[::-1]))
         return np.where(near, smooth, np.nan)[shown], (moved - moved[begin])[shown]
 
@@ -434,12 +397,6 @@ def _wall_path(result: Any, wall: Any, smoothing: Filter, exact: ClosedForm | No
         values, along = path(exact.columns[key] @ normal, -exact.columns[place] @ normal)
         curves.append(Curve(exact.name, values, place=along))
     return [_path(curves, "normal force", "N", f"Wall '{wall.name}'", over)]
-
-
-def _near(force: np.ndarray, smooth: np.ndarray) -> np.ndarray:
-    """Return which rows (n,) bool have a force as computed or filtered, or are beside such a row."""
-    felt = (force != 0.0) | (np.abs(smooth) > 1e-3 * largest(smooth))
-    return np.convolve(felt, np.ones(3), mode="same") > 0.0
 
 
 def _usual_filter(result: Any) -> Filter:
@@ -482,20 +439,44 @@ def draw_curves(
     if not panels:
         raise InputError("plot: no curves named; columns: " + ", ".join(results[0].history))
     first = results[0]
-    labels, captions = _labels_and_captions(results, [name for name, _ in panels], labels)
     if len({result.axis.symbol for result in results}) > 1 and against is None:
         raise InputError("plot: the results are over different axes: " + ", ".join({r.axis.symbol for r in results}))
     exact = closed_form(first) if closed_forms and against is None else None
     times = [read(result.history, "time") for result in results]
-    places = times
+    places, over = times, None
     if against is not None:
         found = [column(result.history, against) for result in results]
         if any(list(each) != [against] for each in found):
             raise InputError(f"plot: against = {against!r} is a vector: name a component, {against}.x, .y, .z or .norm")
         places = [_filtered(r, chosen, against, each[against]) for r, each in zip(results, found, strict=True)]
+        over = against, select(first.history, against).unit or ""
+    drawn = curve_panels(results, panels, exact, labels, places, over)
+    axis = max((result.axis for result in results), key=lambda axis: axis.staged)
+    ends = first.stage_ends if len(results) == 1 and axis.staged else ()
+    return Chart(drawn, first.case.title or first.case.name, np.concatenate(times), axis, ends=ends)
+
+
+def curve_panels(
+    results: Sequence[Any],
+    panels: Sequence[tuple[str, Filter | None]],
+    exact: ClosedForm | None = None,
+    labels: Sequence[str] | None = None,
+    places: Sequence[np.ndarray] | None = None,
+    over: tuple[str, str] | None = None,
+) -> list[Panel]:
+    """Return panels of columns, with the curves of all results; of one result also the range of nodes or bars.
+
+    Parameters
+    ----------
+    results, panels, labels : as of :func:`draw_curves`
+    exact : closed form of the first result
+    places : of the rows of each result (rows,) on the horizontal axis; None: their times
+    over : name and unit of that axis, as :class:`~pfem_petsc.post.chart.Panel` has it
+    """
+    first, drawn = results[0], []
+    labels, captions = _labels_and_captions(results, [name for name, _ in panels], labels)
+    places = [read(result.history, "time") for result in results] if places is None else places
     shared = all(np.array_equal(place, places[0]) for place in places)
-    over = None if against is None else (against, select(first.history, against).unit or "")
-    drawn = []
     columns = [[column(result.history, name) for result in results] for name, _ in panels]
     split = any(len(_parts(found)) > 1 for found in columns)
     for (name, smoothing), caption, found in zip(panels, captions, columns, strict=True):
@@ -505,19 +486,33 @@ def draw_curves(
             values = _filtered(results[number], smoothing, name, curve.values)
             source = "" if shared else labels[number]
             curves.append(curve._replace(values=values, key=key, place=places[number], source=source))
-        for known in exact_curves(exact, [part for part in parts if part in found[0]], places[0]):
-            curves.append(known._replace(values=_filtered(first, smoothing, name, known.values)))
         title = parts[0] if len(parts) == 1 else name  # which component it is
         label = caption or quantity_of(name, whole)
         titles = [title] if not caption and words(title) != label else []
         if smoothing is not None and smoothing.name != AS_COMPUTED:
             titles.append(f"{AS_COMPUTED}, as all energies" if _is_energy(whole) else smoothing.name)
+        if whole.single and whole.values.ndim == 2 + whole.vector and whole.values.shape[1] > 1:
+            summed = name.endswith("/reaction")
+            titles.append(f"{'sum' if summed else 'mean'} of {whole.values.shape[1]}")
+            curves += _ranges(whole, curves) if len(results) == 1 and smoothing is None and not summed else []
+        for known in exact_curves(exact, [part for part in parts if part in found[0]], places[0]):
+            curves.append(known._replace(values=_filtered(first, smoothing, name, known.values)))
         lines = sum(1 + curve.name.count("\n") for curve in curves)
         height = max(0.9, 0.11 * lines)  # of the legend
-        drawn.append(Panel(label, whole.unit or "", curves, ": ".join(titles), height, over, None, len(curves) > 1))
-    axis = max((result.axis for result in results), key=lambda axis: axis.staged)
-    ends = first.stage_ends if len(results) == 1 and axis.staged else ()
-    return Chart(drawn, first.case.title or first.case.name, np.concatenate(times), axis, ends=ends)
+        legend = sum(curve.kind == "line" for curve in curves) > 1
+        drawn.append(Panel(label, whole.unit or "", curves, ": ".join(titles), height, over, None, legend))
+    return drawn
+
+
+def _ranges(whole: Selected, curves: Sequence[Curve]) -> list[Curve]:
+    """Return the ranges of the members of a column as bands around the curves of their means."""
+    low, high = whole.values.min(axis=1), whole.values.max(axis=1)
+    made = []
+    for curve in curves:
+        part = ("xyz".index(curve.key[-1]),) if whole.vector else ()
+        bounds = np.stack([low[:, *part], high[:, *part]], axis=1)
+        made.append(Curve("", bounds, {"color": curve.style["color"], "alpha": 0.15}, place=curve.place, kind="band"))
+    return made
 
 
 def _curves_of(

@@ -80,8 +80,7 @@ class Curve(NamedTuple):
     key : its name in tables, if that is another one
     place : (n,) on the axis of the panel; None: the times of the chart
     source : of the places, in tables, where curves of a panel have different ones
-    kind : ``line``; ``area``, on top of the areas before it; ``band``; ``steps`` of integers, or ``steps before``,
-        which hold up to the place
+    kind : ``line``; ``area``, on top of the areas before it; ``band``
     """
 
     name: str
@@ -147,16 +146,6 @@ def area(k: int) -> dict[str, Any]:
     colour = COLOURS[k % len(COLOURS)]
     hatch = (None, "///", "\\\\\\", "...", "xxx")[k // len(COLOURS) % 5]
     return {"facecolor": colour, "edgecolor": "white", "hatch": hatch, "alpha": 0.85}
-
-
-def _fill_steps(axes: Any, place: np.ndarray, counts: np.ndarray, side: str, style: Mapping[str, Any]) -> None:
-    """Draw integers as steps, with the area below them."""
-    from matplotlib.ticker import MaxNLocator
-
-    axes.plot(place, counts, **style, linewidth=1.0, drawstyle=f"steps-{side}")
-    axes.fill_between(place, counts, step=side, color=style["color"], alpha=0.15, linewidth=0)
-    axes.yaxis.set_major_locator(MaxNLocator(integer=True, nbins=5))
-    axes.set_ylim(0, max(1.0, 1.08 * float(counts.max(initial=0.0))))
 
 
 def _same_widths(axes: Any, ends: np.ndarray) -> None:
@@ -301,9 +290,6 @@ class Chart:
             if curve.kind == "area":
                 axes.fill_between(x, above, above := above + np.maximum(y, 0.0), linewidth=0, **style)
                 axes.fill_between(x, below, below := below + np.minimum(y, 0.0), linewidth=0, **style | {"label": None})
-            elif curve.kind.startswith("steps"):
-                side = "pre" if curve.kind == "steps before" else "post"
-                _fill_steps(axes, x, values, side, {**distinct(number), **style})
             else:
                 point = {"marker": "o"} if len(place) == 1 else {}  # a line needs two points
                 axes.plot(x, y, **{**distinct(number), **point, **style})

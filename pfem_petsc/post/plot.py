@@ -153,7 +153,7 @@ def _usual(
         "pairs": force_panels(result, "pair", forces),
         "constraints": force_panels(result, "constraint", forces),
         "force_displacement": (force_displacement(result, forces, exact), "", 1),
-        "solver": (solver(history), "", 1),
+        "solver": (solver(result), "", 1),
     }
     written = []
     for name, (panels, note, columns) in drawn.items():
@@ -273,22 +273,17 @@ def _moving(
     return shown, f"{_SHADED} {note}".strip() if shaded else note
 
 
-def solver(history: History) -> list[Panel]:
+def solver(result: Any) -> list[Panel]:
     """The iterations of the steps, and the nodes in contact where no other picture has them."""
-    labels = {"newton_iterations": "Newton\niterations", "linear_iterations": "linear\niterations"}
-    labels["active_contacts"] = "nodes in\ncontact"
-    names = [name for name in labels if name in history]
-    # without iterations (explicit schemes) or without walls these panels would be empty
+    history = result.history
+    names = [name for name in ("newton_iterations", "linear_iterations") if np.any(history.get(name, 0))]
     contacts = [name for name in history if name.startswith("wall/") and name.endswith("/contacts")]
-    names = [name for name in names if (contacts and name == "active_contacts") or np.any(history[name])]
-    single = len(contacts) == 1 and np.array_equal(history[contacts[0]], history["active_contacts"])
-    if names == ["active_contacts"] and single:  # which is in the picture of the walls
-        return []
-    panels = []
-    for name in names:
-        kind = "steps before" if name.endswith("_iterations") else "steps"
-        curve = Curve("", history[name], {"color": COLOURS[len(panels)]}, " ".join(labels[name].split()), kind=kind)
-        panels.append(Panel(labels[name], "", [curve], height=0.7, legend=False))
+    shown = len(contacts) == 1 and np.array_equal(history[contacts[0]], history["active_contacts"])  # with the walls
+    names += ["active_contacts"] if contacts and (names or not shown) else []
+    panels = curve_panels([result], [(name, None) for name in names])
+    for name, panel in zip(names, panels, strict=True):  # iterations are those of the step before a row
+        style = {"drawstyle": "steps-pre" if name.endswith("iterations") else "steps-post"}
+        panel.curves = [curve._replace(style={**curve.style, **style}) for curve in panel.curves]
     return panels
 
 
@@ -323,7 +318,7 @@ def force_panels(
             heading = ""
         if felt and f"{source}/{name}/contacts" in history:
             counts = history[f"{source}/{name}/contacts"]
-            curve = Curve("", counts, {"color": COLOURS[1]}, f"{source}/{name}/contacts", kind="steps")
+            curve = Curve("", counts, {"color": COLOURS[1], "drawstyle": "steps-post"}, f"{source}/{name}/contacts")
             panels.append(Panel("nodes in\ncontact", "", [curve], height=0.5, legend=False))
     silent = [f"'{name}'" for name in names if felt and name not in felt]
     return panels, f"No force throughout: {', '.join(silent)}." if silent else "", 1

@@ -128,11 +128,7 @@ def closed_form(result: Any) -> ClosedForm | None:
     """
     if not hasattr(result.case, "mesh") or result.case.stage or len(result.history["time"]) == 0:
         return None
-    for find in FORMS:
-        found = find(result)
-        if found is not None:
-            return found
-    return None
+    return rod_on_wall(result) or von_mises(result)
 
 
 def rod_on_wall(result: Any) -> ClosedForm | None:
@@ -171,12 +167,10 @@ def rod_on_wall(result: Any) -> ClosedForm | None:
         return None
     modulus, density = material.young_modulus, material.density
     c, length = math.sqrt(modulus / density), float(np.ptp(along))
-    impact = (axis * wall.point[0] - float(along.max())) / speed
-    time = np.asarray(history["time"], dtype=float)
+    time, impact = read(history, "time"), (axis * wall.point[0] - float(along.max())) / speed
     since, travel = time - impact, length / c
     touching = (since >= 0.0) & (since <= 2.0 * travel)
-    normal = np.asarray(wall.normal, dtype=float) / np.linalg.norm(wall.normal)
-    force = f"wall/{wall.name}/force"
+    force, normal = f"wall/{wall.name}/force", np.asarray(wall.normal, dtype=float) / np.linalg.norm(wall.normal)
     limit = getattr(material, "yield_stress", None)
     if limit is not None and speed > limit / (density * c):
         hardening = material.isotropic_hardening + material.kinematic_hardening
@@ -239,9 +233,6 @@ def von_mises(result: Any) -> ClosedForm | None:
     return ClosedForm("closed form of two bars", path=(rise - height, load_z / load.force[2]))
 
 
-FORMS: tuple[Callable[[Any], ClosedForm | None], ...] = (rod_on_wall, von_mises)
-
-
 def _keys(table: Any) -> set[str]:
     """Return the keys of a table that differ from their defaults."""
     return set(table.model_dump(exclude_defaults=True, exclude_none=True))
@@ -263,7 +254,7 @@ def _holds_end(case: Any, wall: Any, points: np.ndarray, end: int) -> bool:
     chosen = case.node_set[wall.node_set]
     if chosen.nearest is not None:
         return int(np.argmin(np.linalg.norm(points - np.array(chosen.nearest), axis=1))) == end
-    return bool(chosen.all) or (chosen.indices is not None and end in chosen.indices)
+    return bool(chosen.all) or end in (chosen.indices or ())
 
 
 AS_COMPUTED = "as computed"
@@ -459,11 +450,10 @@ def _two_passes(
 
 def _evenly(time: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return times and values at even steps, of the median length if they are uneven."""
-    steps = np.diff(time)
-    if np.any(steps <= 0.0):
-        keep = np.concatenate([[True], steps > 0.0])  # stages begin with a row at the end of the last one
+    keep = np.diff(time, prepend=-np.inf) > 0.0  # stages begin with a row at the end of the last one
+    if not keep.all():
         time, values = time[keep], values[keep]
-        steps = np.diff(time)
+    steps = np.diff(time)
     if len(steps) == 0 or np.ptp(steps) <= 1e-6 * steps.max():
         return time, values
     grid = np.linspace(time[0], time[-1], max(3, round((time[-1] - time[0]) / float(np.median(steps))) + 1))

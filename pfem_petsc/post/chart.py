@@ -65,8 +65,7 @@ STYLE: dict[str, Any] = {
     "figure.facecolor": "white",
 }
 
-_WIDTHS = {1: 8.6, 2: 10.4}
-"""Widths of pictures by the number of columns [inch]."""
+_WIDTH = 8.6  # of pictures [inch]
 
 
 class Curve(NamedTuple):
@@ -212,17 +211,16 @@ def check_formats(formats: Iterable[str]) -> tuple[str, ...]:
 
 
 class Chart:
-    """Panels row by row in a grid, over a common axis unless they have one of their own.
+    """Panels below each other, over a common axis unless they have one of their own.
 
     What is drawn is kept in SI units, with all points, and can be written as a table.
 
     Parameters
     ----------
-    panels : None leaves a place empty
+    panels : from above
     title : of the figure
     time : (n,) [s], or in the unit of the axis
     axis : what the times are
-    columns : of the grid
     note : text below the panels
     ends : start of the first stage and ends of all, which get the same width where load factors and times are on one
         axis
@@ -235,41 +233,33 @@ class Chart:
 
     def __init__(
         self,
-        panels: Sequence[Panel | None],
+        panels: Sequence[Panel],
         title: str,
         time: np.ndarray,
         axis: Axis = TIME,
-        columns: int = 1,
         note: str = "",
         ends: Sequence[float] = (),
     ) -> None:
         from matplotlib.figure import Figure
 
-        drawn = [panel for panel in panels if panel]
-        heights = [max(p.height for p in panels[k : k + columns] if p) for k in range(0, len(panels), columns)]
-        size = _WIDTHS.get(columns, 4.4 * columns), 0.9 + 2.5 * sum(heights)
-        self.figure = Figure(figsize=size, layout="constrained")
-        own = any(panel.over for panel in drawn)
-        grid = self.figure.subplots(
-            len(heights), columns, sharex=False if own else "col", squeeze=False, height_ratios=heights
-        )
-        self.axes = [axes for axes, panel in zip(grid.flat, panels, strict=True) if panel]
+        heights = [panel.height for panel in panels]
+        self.figure = Figure(figsize=(_WIDTH, 0.9 + 2.5 * sum(heights)), layout="constrained")
+        own = any(panel.over for panel in panels)
+        grid = self.figure.subplots(len(panels), sharex=not own, squeeze=False, height_ratios=heights)
+        self.axes = grid.ravel().tolist()
         self.figure.suptitle(literal(title), x=0.01, ha="left", fontsize=13, fontweight="bold", color="#1f242c")
         if note:
             self.figure.supxlabel(literal(note), x=0.01, ha="left", fontsize=9, color="#5b6472", wrap=True)
         self.time, self._axis, self._ends = np.asarray(time, dtype=float), axis, ends
         self._columns: list[tuple[str, np.ndarray, str, np.ndarray]] = []
-        sizes = [(panel.unit, panel.size) for panel in drawn if panel.scale is None]
-        sizes += [(panel.over[1], largest(curve.place)) for panel in drawn if panel.over for curve in panel.curves]
+        sizes = [(panel.unit, panel.size) for panel in panels if panel.scale is None]
+        sizes += [(panel.over[1], largest(curve.place)) for panel in panels if panel.over for curve in panel.curves]
         self.scales = {unit: common_prefix([size for other, size in sizes if other == unit], unit) for unit, _ in sizes}
-        for number, (axes, panel) in enumerate(zip(grid.flat, panels, strict=True)):
-            if panel is None:
-                axes.remove()
-            else:
-                self._draw(axes, panel, lowest=not any(panels[number + columns :: columns]))
+        for axes, panel in zip(self.axes, panels, strict=True):
+            self._draw(axes, panel)
 
-    def _draw(self, axes: Any, panel: Panel, lowest: bool) -> None:
-        """Draw a panel; only the lowest one of a column has a label of the common axis."""
+    def _draw(self, axes: Any, panel: Panel) -> None:
+        """Draw a panel; only the lowest one has a label of the common axis."""
         if panel.over is None:
             along, places = self._axis.scale(largest(self.time)), self._axis.label(self._axis.unit)
             label = self._axis.label(along[1])
@@ -305,7 +295,7 @@ class Chart:
             axes.set_yscale("log")
         if panel.over is None and len(self._ends) > 2:
             _same_widths(axes, np.asarray(self._ends))
-        if lowest or panel.over:
+        if panel.over or axes is self.axes[-1]:
             axes.tick_params(labelbottom=True)
             axes.set_xlabel(label)
         if panel.legend and axes.get_legend_handles_labels()[0]:

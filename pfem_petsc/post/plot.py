@@ -146,20 +146,20 @@ def _usual(
     forces = chosen or _usual_filter(result)
     drawn = {
         "energies": energies(history, exact),
-        "momentum": momentum(result, exact) if result.stretches else ([], "", 1),
+        "momentum": momentum(result, exact) if result.stretches else ([], ""),
         "probes": probes(result, exact),
         "bars": bars(result),
         "walls": force_panels(result, "wall", forces, exact),
         "pairs": force_panels(result, "pair", forces),
         "constraints": force_panels(result, "constraint", forces),
-        "force_displacement": (force_displacement(result, forces, exact), "", 1),
-        "solver": (solver(result), "", 1),
+        "force_displacement": (force_displacement(result, forces, exact), ""),
+        "solver": (solver(result), ""),
     }
     written = []
-    for name, (panels, note, columns) in drawn.items():
+    for name, (panels, note) in drawn.items():
         if panels:
             ends = result.stage_ends if result.axis.staged else ()
-            chart = Chart(panels, title, read(history, "time"), result.axis, columns, note, ends)
+            chart = Chart(panels, title, read(history, "time"), result.axis, note, ends)
             written += chart.save(folder / name, suffixes)
     if "csv" in suffixes and hasattr(result, "table"):
         written.append(result.table().to_csv(folder / "history.csv"))
@@ -173,14 +173,14 @@ def _free(file: Path, suffixes: Sequence[str]) -> Path:
     return next(free)
 
 
-def energies(history: History, exact: ClosedForm | None = None) -> tuple[list[Panel], str, int]:
+def energies(history: History, exact: ClosedForm | None = None) -> tuple[list[Panel], str]:
     """Stacked stored and lost energies with what was supplied, the terms one by one, and the balance.
 
-    Each picture is panels, and may have a note below them and a number of columns.
+    Each picture is panels, and may have a note below them.
     """
     error = balance_error(history)
     if error is None:
-        return [], "", 1
+        return [], ""
     held = energies_of(history)
     most = max(float(np.nanmax(np.abs(values))) for values in held.values())
     moving = {name: values for name, values in held.items() if np.abs(values).max() > 1e-12 * most}
@@ -210,10 +210,10 @@ def energies(history: History, exact: ClosedForm | None = None) -> tuple[list[Pa
         Panel("energy", "J", lines, "", 1.3),
         Panel("balance error,\nshare of largest", "J", [balance], "", 0.7, scale=share),
     ]
-    return panels, f"Zero throughout: {', '.join(still)}." if still else "", 1
+    return panels, f"Zero throughout: {', '.join(still)}." if still else ""
 
 
-def momentum(result: Any, exact: ClosedForm | None = None) -> tuple[list[Panel], str, int]:
+def momentum(result: Any, exact: ClosedForm | None = None) -> tuple[list[Panel], str]:
     """Momentum, angular momentum and the displacement of the centre of mass, without those that do not change."""
     history, scales = result.history, {}
     names = {words(name): name for name in ("momentum", "angular_momentum") if name in history}
@@ -223,10 +223,10 @@ def momentum(result: Any, exact: ClosedForm | None = None) -> tuple[list[Panel],
         arm = np.linalg.norm(read(history, "centre_of_mass"), axis=1)
         scales["angular momentum"] = largest(arm * np.linalg.norm(read(history, "momentum"), axis=1))
     shown, note = _moving(result, names, scales, exact)
-    return (shown if any(panel.size > 0.0 for panel in shown) else []), note, 1
+    return (shown if any(panel.size > 0.0 for panel in shown) else []), note
 
 
-def probes(result: Any, exact: ClosedForm | None = None) -> tuple[list[Panel], str, int]:
+def probes(result: Any, exact: ClosedForm | None = None) -> tuple[list[Panel], str]:
     """Displacement, velocity and reaction of each probe, without those that do not change."""
     names, scales = {}, {}
     for source in result.history:
@@ -235,14 +235,14 @@ def probes(result: Any, exact: ClosedForm | None = None) -> tuple[list[Panel], s
             name = f"{'displacement' if quantity == 'position' else quantity} of {probe}"
             names[name] = source.replace("/position", "/displacement")
             scales[name] = 1e-3 * largest(read(result.history, source)) if quantity == "position" else 0.0
-    return *_moving(result, names, scales, exact), 1
+    return _moving(result, names, scales, exact)
 
 
-def bars(result: Any) -> tuple[list[Panel], str, int]:
+def bars(result: Any) -> tuple[list[Panel], str]:
     """Axial force and stress of the bars of each probe."""
     names = [name for name in result.history if name.startswith("bar/") and not name.endswith("/strain")]
     panels = curve_panels([result], [(name, None) for name in names])
-    return panels, _SHADED if any(len(panel.curves) > 1 for panel in panels) else "", 2
+    return panels, _SHADED if any(len(panel.curves) > 1 for panel in panels) else ""
 
 
 _SHADED = "Shaded: the range of the nodes or bars."
@@ -289,7 +289,7 @@ def solver(result: Any) -> list[Panel]:
 
 def force_panels(
     result: Any, source: str, smoothing: Filter, exact: ClosedForm | None = None
-) -> tuple[list[Panel], str, int]:
+) -> tuple[list[Panel], str]:
     """The forces of all walls, or of all pairs or constraints, and the nodes in contact where they are counted.
 
     Forces are drawn as computed and filtered; before the run, they are zero. Those of none have a panel only if all do.
@@ -321,7 +321,7 @@ def force_panels(
             curve = Curve("", counts, {"color": COLOURS[1], "drawstyle": "steps-post"}, f"{source}/{name}/contacts")
             panels.append(Panel("nodes in\ncontact", "", [curve], height=0.5, legend=False))
     silent = [f"'{name}'" for name in names if felt and name not in felt]
-    return panels, f"No force throughout: {', '.join(silent)}." if silent else "", 1
+    return panels, f"No force throughout: {', '.join(silent)}." if silent else ""
 
 
 def force_displacement(result: Any, smoothing: Filter, exact: ClosedForm | None = None) -> list[Panel]:

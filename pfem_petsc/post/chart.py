@@ -104,7 +104,6 @@ class Panel:
     height : relative to others
     over : name and unit of the horizontal axis; None: that of the chart
     scale : factor and unit of the vertical axis; None: by the values
-    along : the same of the horizontal axis that is its own; None: by the places
     legend : whether there is one, beside the panel
     log : whether the vertical axis is logarithmic
     """
@@ -118,7 +117,6 @@ class Panel:
     scale: tuple[float, str] | None = None
     legend: bool = True
     log: bool = False
-    along: tuple[float, str] | None = None
 
     @property
     def size(self) -> float:
@@ -265,7 +263,7 @@ class Chart:
             label = self._axis.label(along[1])
         else:
             name, unit = panel.over
-            along, places = panel.along or self.scales[unit], f"{name} [{unit}]" if unit else name
+            along, places = self.scales[unit], f"{name} [{unit}]" if unit else name
             label = f"{name.replace('_', ' ')} [{along[1]}]" if unit else name.replace("_", " ")
         factor, shown = panel.scale or self.scales[panel.unit]
         above = below = 0.0

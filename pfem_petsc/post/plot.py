@@ -666,22 +666,19 @@ def draw_spectra(
             time = read(results[number].history, "time")
             rows = max(results[number].stretches, key=lambda rows, time=time: float(np.ptp(time[rows])))
             frequency, amplitude = amplitude_spectrum(time[rows], curve.values[rows], window)
-            curves.append(curve._replace(values=amplitude, place=frequency))
+            kept = frequency <= (highest or np.inf)
+            curves.append(curve._replace(values=amplitude[kept], place=frequency[kept]))
         label = f"amplitude of\n{caption or quantity_of(name, whole)}"
-        title = f"window: {window}" if caption else f"{name}, window: {window}"
-        along = prefix_for(highest or max(curve.place[-1] for curve in curves), "Hz")
-        scale = (1.0, whole.unit or "")
-        panels.append(
-            Panel(label, scale[1], curves, title, 1.1, ("frequency", "Hz"), scale, len(curves) > 1, True, along)
-        )
+        title, scale = f"window: {window}" if caption else f"{name}, window: {window}", (1.0, whole.unit or "")
+        several = len(curves) > 1
+        panels.append(Panel(label, scale[1], curves, title, 1.1, ("frequency", "Hz"), scale, several, log=True))
     chart = Chart(panels, first.case.title or first.case.name, np.zeros(1))
+    factor, shown = chart.scales["Hz"]
     for axes, panel in zip(chart.axes, panels, strict=True):
-        factor, shown = panel.along
         end = highest or max(curve.place[-1] for curve in panel.curves)
-        inside = [(curve.place > 0.0) & (curve.place <= end) for curve in panel.curves]
-        top = max(largest(curve.values[part]) for curve, part in zip(panel.curves, inside, strict=True))
+        top = max(largest(curve.values[curve.place > 0.0]) for curve in panel.curves)
         if len(panel.curves) == 1:
-            _tell_peaks(axes, panel.curves[0].place[inside[0]], panel.curves[0].values[inside[0]], factor, shown)
+            _tell_peaks(axes, panel.curves[0].place[1:], panel.curves[0].values[1:], factor, shown)
         if top > 0.0:
             axes.set_ylim(1e-6 * top, 4.0 * top)
         axes.set_xlim(0.0, end * factor)

@@ -537,10 +537,10 @@ def _figure(film: Film) -> Any:
 
 def _wall(plotly: Any, surface: Any) -> Any:
     """Return the face of a wall that nodes touch."""
-    faces = np.asarray(surface.faces)
-    faces = faces[(np.asarray(surface.depth)[faces] == 0.0).all(axis=1)]
-    parts = np.concatenate([faces[:, [0, k, k + 1]] for k in range(1, faces.shape[1] - 1)])
-    corners = dict(zip("ijk", parts.T, strict=True))
-    x, y, z = np.asarray(surface.points, dtype=float).T
+    import pyvista
+
+    touched = (np.asarray(surface.depth)[surface.faces] == 0.0).all(axis=1)
+    face = pyvista.PolyData.from_regular_faces(surface.points, surface.faces[touched]).triangulate()
+    places = dict(zip("xyzijk", (*face.points.T, *face.regular_faces.T), strict=True))
     shade = "rgb({},{},{})".format(*WALL_COLOUR)
-    return plotly.Mesh3d(x=x, y=y, z=z, **corners, color=shade, opacity=0.35, hoverinfo="skip")
+    return plotly.Mesh3d(**places, color=shade, opacity=0.35, hoverinfo="skip")

@@ -113,13 +113,11 @@ def direction(
 def _oblique(normals: Sequence[np.ndarray], upward: np.ndarray) -> np.ndarray:
     """Return the direction of the eye: slightly from above, from the quadrant that sees most walls from the front."""
     first = np.array(_X if abs(upward[0]) < 0.9 else _Y)
-    second = np.cross(upward, first)
-    # -second points towards the viewer in a right-handed picture, the default quadrant
-    quarters = [a * first + b * second for b in (-1.3, 1.3) for a in (0.9, -0.9)]
-    quarters += [1.3 * a * first + 0.9 * b * second for b in (-1.0, 1.0) for a in (1.0, -1.0)]
-    directions = [(each + 0.65 * upward) / np.linalg.norm(each + 0.65 * upward) for each in quarters]
-    seen = [sum(min(0.3, float(normal @ each)) for normal in normals) for each in directions]
-    return directions[int(np.argmax(np.round(seen, 6)))]
+    second = np.cross(upward, first)  # which points away from the viewer of a right-handed picture
+    faced = np.sum([np.zeros(3), *normals], axis=0)
+    way = (0.9 if faced @ first > -1e-6 else -0.9) * first + (1.3 if faced @ second > 1e-6 else -1.3) * second
+    way += 0.65 * upward
+    return way / np.linalg.norm(way)
 
 
 def fit(
@@ -174,12 +172,10 @@ def cameras(options: Any, motion: Any, aspect: float) -> list[Camera]:
     points, reach, count = motion.surroundings, motion.reach, len(motion.frames)
     if not options.orbit and options.follow is None:
         return [fit(points, way, aspect, reach=reach).zoomed(options.zoom)] * count
-    ways = [way] * count
-    if options.orbit:
-        from scipy.spatial.transform import Rotation
+    from scipy.spatial.transform import Rotation
 
-        turns = np.linspace(0.0, np.radians(options.orbit), count)[:, None] * up / np.linalg.norm(up)
-        ways = [(each, up, parallel) for each in Rotation.from_rotvec(turns).apply(towards)]
+    turns = np.linspace(0.0, np.radians(options.orbit), count)[:, None] * up / np.linalg.norm(up)
+    ways = [(each, up, parallel) for each in Rotation.from_rotvec(turns).apply(towards)]
     if options.follow is None:
         centre = motion.bounds.mean(axis=0)
         made = [fit(points, way, aspect, centre=centre, reach=reach) for way in ways]

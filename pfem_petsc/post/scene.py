@@ -302,6 +302,26 @@ def tubes(
     return made
 
 
+def strips(lines: np.ndarray, radius: np.ndarray, ahead: np.ndarray, colour: np.ndarray) -> pyvista.PolyData:
+    """Return flat bars that face the eye, of many a fifth of the time of tubes.
+
+    Parameters
+    ----------
+    lines, radius : as of :func:`tubes`
+    ahead : (3,) or (m, 3), the direction to the eye
+    colour : (m, 2, 3) uint8 of both ends
+    """
+    import pyvista
+
+    side = np.cross(lines[:, 1] - lines[:, 0], ahead)
+    side /= np.maximum(np.linalg.norm(side, axis=1, keepdims=True), 1e-300)
+    places = lines[:, :, None] + radius[:, :, None, None] * np.stack([side, -side], axis=1)[:, None]
+    faces = 4 * np.arange(len(lines))[:, None] + [0, 1, 3, 2]
+    mesh = pyvista.PolyData.from_regular_faces(places.reshape(-1, 3).astype(np.float32), faces)
+    mesh.point_data["colour"] = np.repeat(colour.reshape(-1, 3), 2, axis=0)
+    return mesh
+
+
 @dataclass(frozen=True)
 class Style:
     """How bars are drawn.
@@ -467,7 +487,8 @@ class Scene:
         width = self.width / self.unit
         if self._radius is None:
             return Layer(points, self._bars[bars], colour, width + 2.0 * outline, -width - 1.0)
-        return Layer(points, self._bars[bars], colour, width, radius=self._radius[bars], wider=outline)
+        behind = -1.0 if len(self._bars) > TUBE_LIMIT else 0.0  # flat bars hide nothing of themselves
+        return Layer(points, self._bars[bars], colour, width, behind, self._radius[bars], outline)
 
     def _nearer(self, points: np.ndarray, shift: float, camera: Camera) -> np.ndarray:
         """Return points (n, 3) [m] nearer to the eye by pixels of a page, where they are seen at the same place."""
@@ -492,9 +513,10 @@ class Scene:
             return
         pixel = self.unit * camera.metres(lines.reshape(-1, 3)).reshape(-1, 2) / self.size[1]
         radius = np.maximum(layer.radius[:, None], 0.5 * layer.width * pixel) + (layer.wider or 0.0) * pixel
-        many = len(self._bars) > TUBE_LIMIT
-        sides = 20 if len(self._bars) <= FEW else 8
-        for mesh in tubes(lines, radius, sides, not many, colour=shades):
+        if len(self._bars) > TUBE_LIMIT:
+            self._plotter.add_mesh(strips(lines, radius, camera.ahead(lines[:, 0]), shades), scalars="colour", **look)
+            return
+        for mesh in tubes(lines, radius, 20 if len(self._bars) <= FEW else 8, True, colour=shades):
             self._plotter.add_mesh(mesh, scalars="colour", culling=layer.wider is not None and "front", **look)
 
     def _add_walls(self, surfaces: Sequence[Surface], camera: Camera) -> None:

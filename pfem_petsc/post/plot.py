@@ -294,9 +294,9 @@ def force_panels(
 
     Forces are drawn as computed and filtered; before the run, they are zero. Those of none have a panel only if all do.
     """
-    history, panels = result.history, []
-    names = [name.removeprefix(f"{source}/").removesuffix("/force") for name in history if name.endswith("/force")]
-    names = [name for name in names if f"{source}/{name}/force" in history]
+    history, panels, plain = result.history, [], make_filter("none")
+    forces = [name for name in history if name.startswith(f"{source}/") and name.endswith("/force")]
+    names = [name.removeprefix(f"{source}/").removesuffix("/force") for name in forces]
     felt = [name for name in names if np.any(history[f"{source}/{name}/force"])]
     normals = {wall.name: wall.normal for wall in result.case.every_wall if hasattr(wall, "normal")}
     for name in felt or names:
@@ -304,16 +304,13 @@ def force_panels(
         # pairs and constraints may have the name of a wall
         normal = normals.get(name) if source == "wall" else None
         values, label = _pressing(read(history, key), normal)
-        forms = {AS_COMPUTED: (values, 0.9)}
-        if felt:
-            forms.setdefault(smoothing.name, (smoothed(result, smoothing, values, True), 1.6))
-        for form, (drawn, width) in forms.items():
-            curves = [Curve(form, drawn, {"linewidth": width}, f"{key} {label}, {form}")]
+        forms = [plain, smoothing] if felt and smoothing.name != AS_COMPUTED else [plain]
+        for form in forms:
+            style = {"linewidth": 0.9 if form is plain else 1.6}
+            curves = [Curve(form.name, smoothed(result, form, values, True), style, f"{key} {label}, {form.name}")]
             if exact is not None and key in exact.columns:
-                known = _pressing(exact.columns[key], normal)[0]
-                if form != AS_COMPUTED:
-                    known = smoothed(result, smoothing, known, True)
-                curves.append(Curve(exact.name, known, REFERENCE, f"{key} closed form, {form}"))
+                known = smoothed(result, form, _pressing(exact.columns[key], normal)[0], True)
+                curves.append(Curve(exact.name, known, REFERENCE, f"{key} closed form, {form.name}"))
             panels.append(Panel(label, "N", curves, heading, 0.9))
             heading = ""
         if felt and f"{source}/{name}/contacts" in history:
@@ -342,11 +339,12 @@ def force_displacement(result: Any, smoothing: Filter, exact: ClosedForm | None 
 
 
 def _path(curves: list[Curve], label: str, unit: str, heading: str, over: str) -> Panel:
-    few = {"marker": "o", "markersize": 3} if len(curves[0].place) < 80 else {}
-    curves[0] = curves[0]._replace(style={"color": COLOURS[0], **few}, key=f"{heading} {label}, {curves[0].name}")
-    for k, curve in enumerate(curves[1:], start=1):
-        curves[k] = curve._replace(style=REFERENCE, key=f"{heading} {label}, closed form", source="closed form")
-    return Panel(label, unit, curves, heading, over=(over, "m"))
+    first, *known = curves
+    few = {"marker": "o", "markersize": 3} if len(first.place) < 80 else {}
+    drawn = [first._replace(style={"color": COLOURS[0], **few}, key=f"{heading} {label}, {first.name}")]
+    key = f"{heading} {label}, closed form"
+    drawn += [curve._replace(style=REFERENCE, key=key, source="closed form") for curve in known]
+    return Panel(label, unit, drawn, heading, over=(over, "m"))
 
 
 def _load_paths(history: History, exact: ClosedForm | None) -> list[Panel]:

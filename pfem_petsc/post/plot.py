@@ -228,13 +228,16 @@ def momentum(result: Any, exact: ClosedForm | None = None) -> tuple[list[Panel],
 
 def probes(result: Any, exact: ClosedForm | None = None) -> tuple[list[Panel], str]:
     """Displacement, velocity and reaction of each probe, without those that do not change."""
-    names, scales = {}, {}
-    for source in result.history:
-        probe, _, quantity = source.removeprefix("probe/").rpartition("/")
-        if source.startswith("probe/") and quantity in ("position", "velocity", "reaction"):
+    names, scales, history = {}, {}, result.history
+    found = dict.fromkeys(
+        name.removeprefix("probe/").rpartition("/")[0] for name in history if name.startswith("probe/")
+    )
+    for probe, quantity in itertools.product(found, ("position", "velocity", "reaction")):
+        source = f"probe/{probe}/{quantity}"
+        if source in history:
             name = f"{'displacement' if quantity == 'position' else quantity} of {probe}"
             names[name] = source.replace("/position", "/displacement")
-            scales[name] = 1e-3 * largest(read(result.history, source)) if quantity == "position" else 0.0
+            scales[name] = 1e-3 * largest(read(history, source)) if quantity == "position" else 0.0
     return _moving(result, names, scales, exact)
 
 

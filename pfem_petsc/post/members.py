@@ -200,16 +200,14 @@ def instants_of(result: Any, time: float | None, case: str | None) -> list[Insta
     # of a load case or a form, only the end is a state of the truss; before load cases is none, unless it is asked
     ends = [stage.starts_from is not None or _finds_form(stage) for stage in stages]
     wanted = [stage.starts_from is not None or not of_cases or stage.name == case for stage in stages]
-    found = (
-        [Instant("", i) for i in range(len(times))]
-        if not stages
-        else [
+    found = [Instant("", i) for i in range(len(times))]
+    if stages:
+        found = [
             Instant(names[k], i)
             for i, k in enumerate(number.tolist())
             if wanted[k] and (complete[i] or not ends[k]) and case in (None, names[k])
         ]
-    )
-    if not stages and _finds_form(result.case):
+    elif _finds_form(result.case):
         found = found[-1:]
     if not found:
         what = f"no {'load case' if of_cases else 'stage'} has" if case is None else f"{case!r} has not"

@@ -351,7 +351,7 @@ class Layer(NamedTuple):
     width : in pixels of a picture of 1280 by 720; of tubes the least
     shift : how much nearer to the eye than their points they are, in such pixels
     radius : (m,) [m] of tubes; None: lines
-    wider : by how much tubes are wider on each side, in such pixels, with only the sides away from the eye; 0: whole
+    wider : by how much tubes are wider on each side, in such pixels, with only the sides away from the eye; None: whole
     """
 
     points: np.ndarray
@@ -448,10 +448,9 @@ class Scene:
         shades = colours[self._bars[left]] if self._on_nodes else colours[left, None]
         width, radius = self.width / self.unit, None if self._radius is None else self._radius[left]
         bars = Layer(points, self._bars[left], shades, width, radius=radius)
-        if self._rims:
-            self._add(
-                bars._replace(colour=_EDGE * shades, shift=0.0 if radius is not None else -width, wider=0.0), camera
-            )
+        if self._rims:  # lines in a dark shade behind, or wider tubes seen from within
+            behind = -width if radius is None else 0.0
+            self._add(bars._replace(colour=_EDGE * shades, shift=behind, wider=0.0), camera)
             bars = bars._replace(width=_CORE * width, radius=None if radius is None else _CORE * radius)
         for layer in (bars, *layers):
             self._add(layer, camera)

@@ -159,10 +159,7 @@ class Checkpoint:
 
 def newest_checkpoint(folder: Path | str) -> Path | None:
     """Return the newest checkpoint of an output folder, or None. Not collective."""
-    for name in (NAME, PREVIOUS):
-        if (Path(folder) / name).is_file():
-            return Path(folder) / name
-    return None
+    return next((path for path in (Path(folder, NAME), Path(folder, PREVIOUS)) if path.is_file()), None)
 
 
 def asked_checkpoint(folder: Path | str, asked: bool | Path | str) -> Path | None:

@@ -6,7 +6,7 @@ import csv
 import html
 import itertools
 import re
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -27,7 +27,7 @@ _SHOWN = 10  # rows shown at the beginning and at the end of a long table
 _COLUMNS = 12  # columns shown of a wide one
 
 
-class Table(Mapping[str, np.ndarray]):
+class Table(dict[str, np.ndarray]):
     """Named columns of one length: ``table["time"]`` is an array (rows,).
 
     Parameters
@@ -36,22 +36,14 @@ class Table(Mapping[str, np.ndarray]):
     """
 
     def __init__(self, columns: Mapping[str, Sequence[Any] | np.ndarray]) -> None:
-        self._columns = {name: _column(values) for name, values in columns.items()}
-        self.n_rows = len(next(iter(self._columns.values()), ()))
-        for name, values in self._columns.items():
+        super().__init__((name, _column(values)) for name, values in columns.items())
+        self.n_rows = len(next(iter(self.values()), ()))
+        for name, values in self.items():
             if len(values) != self.n_rows:
                 raise InputError(f"table: column {name!r} has {len(values)} rows, expected {self.n_rows}")
 
-    def __getitem__(self, name: str) -> np.ndarray:
-        if name not in self._columns:
-            raise KeyError(f"table has no column {name!r}{nearest(str(name), list(self))}")
-        return self._columns[name]
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(self._columns)
-
-    def __len__(self) -> int:
-        return len(self._columns)
+    def __missing__(self, name: str) -> np.ndarray:
+        raise KeyError(f"table has no column {name!r}{nearest(str(name), list(self))}")
 
     @property
     def rows(self) -> list[dict[str, Any]]:

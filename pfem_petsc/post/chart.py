@@ -5,7 +5,6 @@ from __future__ import annotations
 import csv
 import itertools
 import os
-import textwrap
 import warnings
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
@@ -15,6 +14,7 @@ from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy as np
+from cycler import cycler
 
 from ..errors import InputError, written
 from ..output.units import TIME, Axis, common_prefix
@@ -24,7 +24,12 @@ COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#6
 
 DASHES: tuple[Any, ...] = ("-", (0, (6, 2)), (0, (2, 1.5)), (0, (7, 2, 1.5, 2)))
 
-_MARKERS = ("", "o", "s", "^", "D", "v", "P", "X")
+# the dashes of closed forms, which are black as well, come last of those without markers
+_STYLES = tuple(
+    cycler(marker=["", "o", "s", "^", "D", "v", "P", "X"])
+    * cycler(linestyle=[DASHES[k] for k in (0, 2, 3, 1)])
+    * cycler(color=COLOURS)
+)
 
 FORMATS = ("png", "svg", "pdf", "csv")
 
@@ -60,14 +65,7 @@ STYLE: dict[str, Any] = {
     "figure.facecolor": "white",
 }
 
-_WIDTHS = {1: 8.6, 2: 10.4}
-"""Widths of pictures by the number of columns [inch]."""
-_LETTER = 0.075
-"""Width of a letter of a note or a legend [inch]."""
-_LETTERS = 20
-"""Length of names for which legends have room in the usual width."""
-
-_POINTS = 3000  # approximate maximum number of points of a curve, more than a picture has columns
+_WIDTH = 8.6  # of pictures [inch]
 
 
 class Curve(NamedTuple):
@@ -81,8 +79,7 @@ class Curve(NamedTuple):
     key : its name in tables, if that is another one
     place : (n,) on the axis of the panel; None: the times of the chart
     source : of the places, in tables, where curves of a panel have different ones
-    kind : ``line``; ``area``, on top of the areas before it; ``band``; ``steps`` of integers, or ``steps before``,
-        which hold up to the place
+    kind : ``line``; ``area``, on top of the areas before it; ``band``
     """
 
     name: str
@@ -107,7 +104,6 @@ class Panel:
     height : relative to others
     over : name and unit of the horizontal axis; None: that of the chart
     scale : factor and unit of the vertical axis; None: by the values
-    along : the same of the horizontal axis that is its own; None: by the places
     legend : whether there is one, beside the panel
     log : whether the vertical axis is logarithmic
     """
@@ -121,7 +117,6 @@ class Panel:
     scale: tuple[float, str] | None = None
     legend: bool = True
     log: bool = False
-    along: tuple[float, str] | None = None
 
     @property
     def size(self) -> float:
@@ -139,14 +134,8 @@ def distinct(k: int, dash: int | None = None) -> dict[str, Any]:
     k : from 0
     dash : number of another dash, for lines that their colours tell apart
     """
-    lap, number = divmod(k, len(COLOURS))
-    # the dashes of closed forms, which are black as well, come last
-    own = (0, 2, 3, 1)[lap % len(DASHES)] if dash is None else dash
-    style = {"color": COLOURS[number], "linestyle": DASHES[own]}
-    apart = (0.012 * (k % 10), 0.12)  # shares of the picture, so that markers of curves upon each other are beside
-    marker = _MARKERS[(lap + lap // len(_MARKERS)) % len(_MARKERS)]
-    marked = {"marker": marker, "markersize": 4.5, "markevery": apart}
-    return style | (marked if lap else {})
+    marked = {"markersize": 4.5, "markevery": (0.012 * (k % 10), 0.12)}  # so that those of equal curves are apart
+    return {**_STYLES[k % len(_STYLES)], **marked} | ({} if dash is None else {"linestyle": DASHES[dash]})
 
 
 def area(k: int) -> dict[str, Any]:
@@ -154,16 +143,6 @@ def area(k: int) -> dict[str, Any]:
     colour = COLOURS[k % len(COLOURS)]
     hatch = (None, "///", "\\\\\\", "...", "xxx")[k // len(COLOURS) % 5]
     return {"facecolor": colour, "edgecolor": "white", "hatch": hatch, "alpha": 0.85}
-
-
-def _fill_steps(axes: Any, place: np.ndarray, counts: np.ndarray, side: str, style: Mapping[str, Any]) -> None:
-    """Draw integers as steps, with the area below them."""
-    from matplotlib.ticker import MaxNLocator
-
-    axes.plot(place, counts, **style, linewidth=1.0, drawstyle=f"steps-{side}")
-    axes.fill_between(place, counts, step=side, color=style["color"], alpha=0.15, linewidth=0)
-    axes.yaxis.set_major_locator(MaxNLocator(integer=True, nbins=5))
-    axes.set_ylim(0, max(1.0, 1.08 * float(counts.max(initial=0.0))))
 
 
 def _same_widths(axes: Any, ends: np.ndarray) -> None:
@@ -230,17 +209,16 @@ def check_formats(formats: Iterable[str]) -> tuple[str, ...]:
 
 
 class Chart:
-    """Panels row by row in a grid, over a common axis unless they have one of their own.
+    """Panels below each other, over a common axis unless they have one of their own.
 
     What is drawn is kept in SI units, with all points, and can be written as a table.
 
     Parameters
     ----------
-    panels : None leaves a place empty
+    panels : from above
     title : of the figure
     time : (n,) [s], or in the unit of the axis
     axis : what the times are
-    columns : of the grid
     note : text below the panels
     ends : start of the first stage and ends of all, which get the same width where load factors and times are on one
         axis
@@ -253,51 +231,39 @@ class Chart:
 
     def __init__(
         self,
-        panels: Sequence[Panel | None],
+        panels: Sequence[Panel],
         title: str,
         time: np.ndarray,
         axis: Axis = TIME,
-        columns: int = 1,
         note: str = "",
         ends: Sequence[float] = (),
     ) -> None:
         from matplotlib.figure import Figure
 
-        drawn = [panel for panel in panels if panel]
-        heights = [max(p.height for p in panels[k : k + columns] if p) for k in range(0, len(panels), columns)]
-        names = [line for panel in drawn if panel.legend for curve in panel.curves for line in curve.name.split("\n")]
-        # long names in legends make the picture wider, and no panel narrower
-        wider = max(0.0, _LETTER * (max(map(len, names), default=0) - _LETTERS))
-        size = (_WIDTHS.get(columns, 4.4 * columns) + columns * wider, 0.9 + 2.5 * sum(heights))
-        self.figure = Figure(figsize=size, layout="constrained")
-        own = any(panel.over for panel in drawn)
-        grid = self.figure.subplots(
-            len(heights), columns, sharex=False if own else "col", squeeze=False, height_ratios=heights
-        )
-        self.axes = [axes for axes, panel in zip(grid.flat, panels, strict=True) if panel]
+        heights = [panel.height for panel in panels]
+        self.figure = Figure(figsize=(_WIDTH, 0.9 + 2.5 * sum(heights)), layout="constrained")
+        own = any(panel.over for panel in panels)
+        grid = self.figure.subplots(len(panels), sharex=not own, squeeze=False, height_ratios=heights)
+        self.axes = grid.ravel().tolist()
         self.figure.suptitle(literal(title), x=0.01, ha="left", fontsize=13, fontweight="bold", color="#1f242c")
         if note:
-            lines = textwrap.fill(note, int((size[0] - 0.3) / _LETTER))
-            self.figure.supxlabel(literal(lines), x=0.01, ha="left", fontsize=9, color="#5b6472")
+            self.figure.supxlabel(literal(note), x=0.01, ha="left", fontsize=9, color="#5b6472", wrap=True)
         self.time, self._axis, self._ends = np.asarray(time, dtype=float), axis, ends
         self._columns: list[tuple[str, np.ndarray, str, np.ndarray]] = []
-        sizes = [(panel.unit, panel.size) for panel in drawn if panel.scale is None]
-        sizes += [(panel.over[1], largest(curve.place)) for panel in drawn if panel.over for curve in panel.curves]
+        sizes = [(panel.unit, panel.size) for panel in panels if panel.scale is None]
+        sizes += [(panel.over[1], largest(curve.place)) for panel in panels if panel.over for curve in panel.curves]
         self.scales = {unit: common_prefix([size for other, size in sizes if other == unit], unit) for unit, _ in sizes}
-        for number, (axes, panel) in enumerate(zip(grid.flat, panels, strict=True)):
-            if panel is None:
-                axes.remove()
-            else:
-                self._draw(axes, panel, lowest=not any(panels[number + columns :: columns]))
+        for axes, panel in zip(self.axes, panels, strict=True):
+            self._draw(axes, panel)
 
-    def _draw(self, axes: Any, panel: Panel, lowest: bool) -> None:
-        """Draw a panel; only the lowest one of a column has a label of the common axis."""
+    def _draw(self, axes: Any, panel: Panel) -> None:
+        """Draw a panel; only the lowest one has a label of the common axis."""
         if panel.over is None:
             along, places = self._axis.scale(largest(self.time)), self._axis.label(self._axis.unit)
             label = self._axis.label(along[1])
         else:
             name, unit = panel.over
-            along, places = panel.along or self.scales[unit], f"{name} [{unit}]" if unit else name
+            along, places = self.scales[unit], f"{name} [{unit}]" if unit else name
             label = f"{name.replace('_', ' ')} [{along[1]}]" if unit else name.replace("_", " ")
         factor, shown = panel.scale or self.scales[panel.unit]
         above = below = 0.0
@@ -305,23 +271,16 @@ class Chart:
             place = self.time if curve.place is None else np.asarray(curve.place, dtype=float)
             values = np.asarray(curve.values, dtype=float)
             style = {"label": literal(curve.name), **curve.style}
-            if curve.kind in ("area", "band"):
-                every = max(1, len(place) // _POINTS)
-                x, y = place[::every] * along[0], values[::every] * factor
-                if curve.kind == "band":
-                    axes.fill_between(x, y[:, 0], y[:, 1], linewidth=0, **style)
-                    continue
+            x, y = place * along[0], values * factor
+            if curve.kind == "band":
+                axes.fill_between(x, *y.T, linewidth=0, **style)
+                continue
+            if curve.kind == "area":
                 axes.fill_between(x, above, above := above + np.maximum(y, 0.0), linewidth=0, **style)
-                if (y < 0.0).any():
-                    axes.fill_between(
-                        x, below, below := below + np.minimum(y, 0.0), linewidth=0, **style | {"label": None}
-                    )
-            elif curve.kind.startswith("steps"):
-                side = "pre" if curve.kind == "steps before" else "post"
-                _fill_steps(axes, place * along[0], values, side, {**distinct(number), **style})
+                axes.fill_between(x, below, below := below + np.minimum(y, 0.0), linewidth=0, **style | {"label": None})
             else:
-                marker = "o" if len(place) == 1 else None  # a line needs two points
-                axes.plot(place * along[0], values * factor, **{"marker": marker, **distinct(number), **style})
+                point = {"marker": "o"} if len(place) == 1 else {}  # a line needs two points
+                axes.plot(x, y, **{**distinct(number), **point, **style})
             heading = f"{curve.key or curve.name} [{panel.unit}]" if panel.unit else curve.key or curve.name
             over = f"{places}: {curve.source}" if curve.source else places
             if not any(heading == other and over == before for before, _, other, _ in self._columns):
@@ -334,7 +293,7 @@ class Chart:
             axes.set_yscale("log")
         if panel.over is None and len(self._ends) > 2:
             _same_widths(axes, np.asarray(self._ends))
-        if lowest or panel.over:
+        if panel.over or axes is self.axes[-1]:
             axes.tick_params(labelbottom=True)
             axes.set_xlabel(label)
         if panel.legend and axes.get_legend_handles_labels()[0]:

@@ -232,8 +232,8 @@ def _way(result: Any, wall: str, displacement: str | None) -> tuple[np.ndarray, 
         if size == 0.0:
             raise InputError(f"{result.path}: wall {wall!r} is not touched")
         return np.abs(values - values[0]), force / size
-    name = f"wall/{wall}/position"
-    moved = np.asarray(history[name]) - np.asarray(history[name])[0] if name in history else np.zeros((1, 3))
+    places = np.asarray(history.get(f"wall/{wall}/position", np.zeros((1, 3))))
+    moved = places - places[0]
     far = moved[int(np.argmax(np.linalg.norm(moved, axis=1)))]
     length = float(np.linalg.norm(far))
     if length == 0.0:

@@ -128,11 +128,7 @@ def closed_form(result: Any) -> ClosedForm | None:
     """
     if not hasattr(result.case, "mesh") or result.case.stage or len(result.history["time"]) == 0:
         return None
-    for find in FORMS:
-        found = find(result)
-        if found is not None:
-            return found
-    return None
+    return rod_on_wall(result) or von_mises(result)
 
 
 def rod_on_wall(result: Any) -> ClosedForm | None:
@@ -171,12 +167,10 @@ def rod_on_wall(result: Any) -> ClosedForm | None:
         return None
     modulus, density = material.young_modulus, material.density
     c, length = math.sqrt(modulus / density), float(np.ptp(along))
-    impact = (axis * wall.point[0] - float(along.max())) / speed
-    time = np.asarray(history["time"], dtype=float)
+    time, impact = read(history, "time"), (axis * wall.point[0] - float(along.max())) / speed
     since, travel = time - impact, length / c
     touching = (since >= 0.0) & (since <= 2.0 * travel)
-    normal = np.asarray(wall.normal, dtype=float) / np.linalg.norm(wall.normal)
-    force = f"wall/{wall.name}/force"
+    force, normal = f"wall/{wall.name}/force", np.asarray(wall.normal, dtype=float) / np.linalg.norm(wall.normal)
     limit = getattr(material, "yield_stress", None)
     if limit is not None and speed > limit / (density * c):
         hardening = material.isotropic_hardening + material.kinematic_hardening
@@ -239,9 +233,6 @@ def von_mises(result: Any) -> ClosedForm | None:
     return ClosedForm("closed form of two bars", path=(rise - height, load_z / load.force[2]))
 
 
-FORMS: tuple[Callable[[Any], ClosedForm | None], ...] = (rod_on_wall, von_mises)
-
-
 def _keys(table: Any) -> set[str]:
     """Return the keys of a table that differ from their defaults."""
     return set(table.model_dump(exclude_defaults=True, exclude_none=True))
@@ -263,7 +254,7 @@ def _holds_end(case: Any, wall: Any, points: np.ndarray, end: int) -> bool:
     chosen = case.node_set[wall.node_set]
     if chosen.nearest is not None:
         return int(np.argmin(np.linalg.norm(points - np.array(chosen.nearest), axis=1))) == end
-    return bool(chosen.all) or (chosen.indices is not None and end in chosen.indices)
+    return bool(chosen.all) or end in (chosen.indices or ())
 
 
 AS_COMPUTED = "as computed"
@@ -353,20 +344,16 @@ def window_mean(time: np.ndarray, values: np.ndarray, width: float, zero_before:
     It depends on past values only. The integral is exact for any spacing of the points. At the start, the window is
     truncated, unless the curve is zero before it: a spike in the first row would be its own mean.
     """
-    if len(time) < 2 or width <= 0:
+    if len(time) < 2 or width <= 0.0:
         return values.copy()
-    steps = np.diff(time)
-    integral = np.concatenate([[0.0], np.cumsum(0.5 * steps * (values[1:] + values[:-1]))])
+    from scipy.interpolate import BSpline
+
+    knots = np.concatenate([time[:1], time, time[-1:]])  # of a piecewise linear curve, which may jump
+    integral = BSpline(knots, values, 1).antiderivative()
     low = np.maximum(time - width, time[0])
-
-    def primitive(at: np.ndarray) -> np.ndarray:
-        k = np.clip(np.searchsorted(time, at, side="right") - 1, 0, len(steps) - 1)
-        part = at - time[k]
-        slope = (values[k + 1] - values[k]) / np.where(steps[k] > 0, steps[k], 1.0)
-        return integral[k] + part * (values[k] + 0.5 * slope * part)
-
     span = np.full(len(time), width) if zero_before else time - low
-    return np.where(span > 0.0, (integral - primitive(low)) / np.where(span > 0.0, span, 1.0), values)
+    change = integral(time) - integral(low)
+    return np.divide(change, span, out=np.array(values, dtype=float), where=span > 0.0)
 
 
 def cfc(time: np.ndarray, values: np.ndarray, size: float, zero_before: bool = False) -> np.ndarray:
@@ -463,11 +450,10 @@ def _two_passes(
 
 def _evenly(time: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return times and values at even steps, of the median length if they are uneven."""
-    steps = np.diff(time)
-    if np.any(steps <= 0.0):
-        keep = np.concatenate([[True], steps > 0.0])  # stages begin with a row at the end of the last one
+    keep = np.diff(time, prepend=-np.inf) > 0.0  # stages begin with a row at the end of the last one
+    if not keep.all():
         time, values = time[keep], values[keep]
-        steps = np.diff(time)
+    steps = np.diff(time)
     if len(steps) == 0 or np.ptp(steps) <= 1e-6 * steps.max():
         return time, values
     grid = np.linspace(time[0], time[-1], max(3, round((time[-1] - time[0]) / float(np.median(steps))) + 1))

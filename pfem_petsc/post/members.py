@@ -15,7 +15,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -117,12 +116,17 @@ def truss_of(result: Any) -> Truss:
         lengths = model.bars.mesh_lengths[block.start : block.stop]
         shapes = bar_shapes(section, lengths, np.broadcast_to(block.area, lengths.shape))
         strength = material.design_strength or getattr(material, "yield_stress", None)
-        values["section"][own] = sections.index(block.section)
-        values["area"][own], values["length"][own] = shapes.area, lengths
-        values["strength"][own] = np.nan if strength is None else strength
-        known = shapes.second_moment > 0.0
-        values["rigidity"][own] = np.where(known, material.young_modulus * shapes.second_moment, np.nan)
-        values["factor"][own] = section.effective_length
+        rigidity = material.young_modulus * shapes.second_moment
+        found = {
+            "section": sections.index(block.section),
+            "area": shapes.area,
+            "length": lengths,
+            "strength": np.nan if strength is None else strength,
+            "rigidity": np.where(rigidity > 0.0, rigidity, np.nan),
+            "factor": section.effective_length,
+        }
+        for name, each in found.items():
+            values[name][own] = each
     held = [model.nodes[table.node_set] for stage in stages for table in stage.support]
     for table in (*case.spring, *case.dashpot):
         held += [model.nodes[name] for name in (table.between or (table.node_set,))]
@@ -159,12 +163,9 @@ def find_members(points: np.ndarray, ends: np.ndarray, section: np.ndarray, held
     _, label = connected_components(joined, directed=False)
     # in the order of the first bars
     _, begins = np.unique(label, return_index=True)
-    rank = np.empty(len(begins), dtype=np.int64)
-    rank[np.argsort(begins)] = np.arange(len(begins))
     bars = np.flatnonzero(section >= 0)
-    bars = bars[np.argsort(rank[label[bars]], kind="stable")]
-    changes = np.diff(rank[label[bars]], prepend=-1) != 0
-    return Members(bars, np.flatnonzero(changes))
+    bars = bars[np.argsort(begins[label[bars]], kind="stable")]
+    return Members(bars, np.flatnonzero(np.diff(begins[label[bars]], prepend=-1)))
 
 
 class Instant(NamedTuple):
@@ -195,17 +196,19 @@ def instants_of(result: Any, time: float | None, case: str | None) -> list[Insta
     if time is not None and not times[0] <= time <= times[-1] * (1.0 + _ROUNDING):
         raise InputError(f"{result.path}: --time {time:g}: snapshots are from {times[0]:g} to {times[-1]:g}")
     number, complete = _stage_of(result)
-    found = [Instant(names[k] if names else "", i) for i, k in enumerate(number.tolist())]
     of_cases = any(stage.starts_from is not None for stage in stages)
+    # of a load case or a form, only the end is a state of the truss; before load cases is none, unless it is asked
+    ends = [stage.starts_from is not None or _finds_form(stage) for stage in stages]
+    wanted = [stage.starts_from is not None or not of_cases or stage.name == case for stage in stages]
+    found = [Instant("", i) for i in range(len(times))]
     if stages:
-        # of a load case or a form, only the end is a state of the truss; before load cases is none, unless it is asked
-        ends = [stage.starts_from is not None or _finds_form(stage) for stage in stages]
-        wanted = [stage.starts_from is not None or not of_cases or stage.name == case for stage in stages]
-        kept = [wanted[k] and (complete[i] or not ends[k]) for i, k in enumerate(number.tolist())]
-        found = [each for each, keep in zip(found, kept, strict=True) if keep]
+        found = [
+            Instant(names[k], i)
+            for i, k in enumerate(number.tolist())
+            if wanted[k] and (complete[i] or not ends[k]) and case in (None, names[k])
+        ]
     elif _finds_form(result.case):
         found = found[-1:]
-    found = [each for each in found if case is None or each.case == case]
     if not found:
         what = f"no {'load case' if of_cases else 'stage'} has" if case is None else f"{case!r} has not"
         raise InputError(f"{result.path}: {what} been computed to its end")
@@ -382,6 +385,7 @@ def draw_members(
         If no member has a utilisation, there are too many cases, or the picture cannot be made.
     """
     from .chart import opened
+    from .motion import Frames
     from .options import Options
     from .render import Film, save
 
@@ -407,13 +411,8 @@ def draw_members(
         names = [stage.name for stage in result.case.stage]
         order = sorted(range(len(cases)), key=lambda k: names.index(cases[k]) if cases[k] in names else 0)
         # the first snapshot, with the utilisations as its field, once for each case
-        drawn = SimpleNamespace(
-            path=result.path,
-            case=result.case,
-            bars=result.bars,
-            bar_data=result.bar_data,
-            axis=result.axis,
-            history=result.history,
+        drawn = Frames(
+            result,
             times=np.repeat(result.times[:1], len(cases)),
             positions=lambda snapshot: result.positions(0),
             point_fields=(),

@@ -11,6 +11,8 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
+from scipy.cluster.vq import kmeans2
+from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation, Slerp
 
 from ..columns import STATUS
@@ -21,7 +23,7 @@ from ..mechanics.bars import bar_shapes
 from ..mechanics.motion import rotation_of
 from ..mechanics.supports import directions_of
 from ..output.result import check_mesh, stage_at
-from ..output.units import MODE, POINT, Axis, engineering
+from ..output.units import MODE, POINT, engineering
 from ..registry import choices, lookup, nearest
 from .page import GHOST, MARKS, TRAILS
 from .scene import NODE_COLOUR, Camera, Layer, Scene
@@ -35,10 +37,8 @@ STOUT = 0.2
 
 _LARGEST = 0.1  # of the extent of the truss: the largest displacement that is drawn
 PERIOD = 24  # frames of a period
-_STEPWISE = ("status",)  # fields whose numbers stand for words
 
 _STUB = 0.35  # of the initial length: the part of a broken bar that is drawn at each of its nodes
-_MOST_POINTS = 1000  # of a trajectory
 _MOST_NODES = 5000  # of which the outermost are found; of more, the corners of their box are in view
 _WAYS = 200  # directions in which nodes are outermost: a sphere is larger than their hull by 1 %
 
@@ -78,20 +78,17 @@ class Motion:
         self.times = np.asarray(result.times, dtype=float)[self.frames]
         self.n_bars = len(self.bars)
         for mark in options.marks:
-            if mark not in MARKS:
-                raise InputError(f"render: mark = {mark!r} is not known; it is one of {', '.join(MARKS)}")
             if MARKS[mark].field not in result.cell_fields:
                 raise InputError(
                     f"render: mark = {mark!r}: the result holds no field '{MARKS[mark].field}'; "
                     "name it in [output] fields and run again, or leave the mark out"
                 )
-        self._trails = {name: self._trail(name) for name in options.trails}
+        self._trails = {name: self._probe_rows(name) for name in options.trails}
         self.reach, self.hulls = 0.0, [_outermost(self._held(frame)) for frame in self.frames]
         self.boxes = np.array([[points.min(axis=0), points.max(axis=0)] for points in self.hulls])
-        low, high = self.boxes[:, 0].min(axis=0), self.boxes[:, 1].max(axis=0)
-        if options.ghost:
-            low, high = np.fmin(low, self.start.min(axis=0)), np.fmax(high, self.start.max(axis=0))
-        self.bounds = np.array([low, high])
+        self._ghost = [_outermost(self.start)] if options.ghost else []
+        seen = np.concatenate([*self.hulls, *self._ghost])
+        self.bounds = np.array([seen.min(axis=0), seen.max(axis=0)])
         self.actions = Actions(result, options.show, self.times, self.bounds) if options.show else None
         if self.actions is not None:
             for k, frame in enumerate(self.frames):
@@ -102,8 +99,6 @@ class Motion:
         self.surfaces = self._moved(walls)
         self.normals = [wall.normal / np.linalg.norm(wall.normal) for wall in walls if hasattr(wall, "normal")]
         every = np.asarray(result.times, dtype=float)
-        known = result.axis is POINT and "load_factor" in result.history
-        self._factors = [np.asarray(result.history[name]) for name in ("time", "load_factor")] if known else []
         self.time_factor, self.time_unit = result.axis.scale(float(np.abs(every).max()))
         steps = np.diff(np.unique(self.time_factor * every))
         self._decimals = int(np.clip(np.ceil(0.3 - np.log10(np.median(steps))), 0, 6)) if len(steps) else 2
@@ -123,25 +118,21 @@ class Motion:
             if walls[k].type == "plane" and not turned:  # which is drawn beside the structure, wherever it is
                 normal = np.asarray(walls[k].normal) / np.linalg.norm(walls[k].normal)
                 shift = (shift @ normal) * normal
-            if surface is not None:
-                moved = replace(surface, points=surface.points + shift) if shift.any() and not turned else surface
-                if turned:
-                    centre = _place(walls[k])
-                    moved = replace(surface, points=(surface.points - centre) @ turn.T + centre + shift)
-                surfaces[self.frames[row]].append(moved)
+            if surface is not None and (turned or shift.any()):
+                centre = _place(walls[k])
+                surface = replace(surface, points=(surface.points - centre) @ turn.T + centre + shift)
+            surfaces[self.frames[row]] += [] if surface is None else [surface]
         return surfaces
 
     @property
     def surroundings(self) -> np.ndarray:
         """Points (n, 3) [m] that the camera has in view: the motion, and walls near it."""
-        near = self.hulls + ([_outermost(self.start)] if self._options.ghost else [])
+        near = [*self.hulls, *self._ghost]
         size = float(np.linalg.norm(self.bounds[1] - self.bounds[0])) or 1.0
-        drawn = {id(surface): surface.points for each in self.surfaces.values() for surface in each}
-        for points in drawn.values():
+        for points in {id(wall): wall.points for walls in self.surfaces.values() for wall in walls}.values():
             # a distant wall would shrink the structure to a dot: it is drawn but does not affect the view
             gap = np.maximum(points.min(axis=0) - self.bounds[1], self.bounds[0] - points.max(axis=0))
-            if gap.max() < 0.6 * size:
-                near.append(points)
+            near += [points] if gap.max() < 0.6 * size else []
         return np.concatenate(near)
 
     @property
@@ -166,18 +157,16 @@ class Motion:
         points = np.asarray(self.result.positions(frame), dtype=float)
         return points if self.scale == 1.0 else self.start + self.scale * (points - self.start)
 
-    def gone(self, frame: int) -> np.ndarray | None:
-        """Return the bars (b,) that have left the model, None if the result does not tell."""
+    def whole(self, frame: int) -> np.ndarray:
+        """Return which bars (b,) have not left the model; all if the result does not tell."""
         if "status" not in self.result.cell_fields:
-            return None
-        return np.asarray(self.result.field("status", frame)) == STATUS.index("broken")
+            return np.full(self.n_bars, True)
+        return np.asarray(self.result.field("status", frame)) != STATUS.index("broken")
 
     def _held(self, frame: int) -> np.ndarray:
         """Return the positions of nodes with bars: others may fly far away, and would shrink the picture."""
-        points, gone = self.positions(frame), self.gone(frame)
-        if gone is None or gone.all():
-            return points
-        return points[np.unique(self.bars[~gone])]
+        points, whole = self.positions(frame), self.whole(frame)
+        return points[np.unique(self.bars[whole])] if whole.any() else points
 
     def time(self, frame: int) -> str:
         """The heading of a frame."""
@@ -186,8 +175,10 @@ class Motion:
         axis, time = self.result.axis, self.result.times[frame]
         if axis.staged:
             return self.result.place(time)
+        if axis is POINT and "load_factor" in (history := self.result.history):
+            return f"{axis.place(time)}, load factor {np.interp(time, history['time'], history['load_factor']):.4g}"
         if not axis.unit:
-            return axis.place(time) + (f", load factor {np.interp(time, *self._factors):.4g}" if self._factors else "")
+            return axis.place(time)
         return f"{axis.symbol} = {time * self.time_factor:.{self._decimals}f} {self.time_unit}"
 
     def probe(self, name: str) -> np.ndarray:
@@ -205,24 +196,17 @@ class Motion:
         when, places = np.asarray(history["time"], dtype=float), np.asarray(history[column], dtype=float)
         return when, places if self.scale == 1.0 else places[0] + self.scale * (places - places[0])
 
-    def _trail(self, name: str) -> tuple[np.ndarray, np.ndarray]:
-        when, places = self._probe_rows(name)
-        rows = np.unique(np.linspace(0, len(when) - 1, _MOST_POINTS).astype(int))
-        return when[rows], places[rows]
-
     def layers(self, frame: int, scene: Scene, camera: Camera) -> list[Layer]:
         """Return what is drawn in addition to the bars of a frame."""
         made, points, thick = [], self.positions(frame), scene.thickness(camera)
-        width, gone = scene.width / scene.unit, self.gone(frame)
+        width, whole = scene.width / scene.unit, self.whole(frame)
         if self._options.ghost:
             made.append(Layer(self.start, self.bars, GHOST, float(np.clip(0.6 * width, 1.2, 2.4)), -thick))
         if "yielded" in self._options.marks:
             yielded = np.asarray(self.result.field("plastic_strain", frame)) != 0.0
-            if gone is not None:
-                yielded &= ~gone
-            made.append(scene.rim(points, np.flatnonzero(yielded), MARKS["yielded"].colour))
-        if "broken" in self._options.marks and gone is not None:
-            made.append(self._stubs(points, gone, width))
+            made.append(scene.rim(points, np.flatnonzero(yielded & whole), MARKS["yielded"].colour))
+        if "broken" in self._options.marks:
+            made.append(self._stubs(points, ~whole, width))
         if self.actions is not None:
             made += self.actions.layers(self.frames.index(frame), points, camera)
         for number, (when, places) in enumerate(self._trails.values()):
@@ -242,9 +226,13 @@ class Motion:
 
 
 MOST_SYMBOLS = 40
-"""Nodes with symbols; of more, some of them, at distances."""
+"""Nodes that all have symbols."""
+_SOME = 24  # of more, which are evenly spread
 _SYMBOL, _ARROW, _HEAD = 0.03, 0.14, 0.022  # of the diagonal of the truss: supports, the longest arrow, its head
-_APART = 0.05  # of the diagonal: the least distance of symbols, about, where there are many nodes
+# symbols of supports, in units of their size: lines between points, away from the node and across
+_TRIANGLE = np.array([[(0.0, 0.0), (1.0, 0.55)], [(1.0, 0.55), (1.0, -0.55)], [(1.0, -0.55), (0.0, 0.0)]])
+_STROKES = np.array([[(1.0, at), (1.3, at - 0.165)] for at in (0.55, 0.275, 0.0, -0.275)])  # below where nothing moves
+_TRACK = np.array([[(1.3, 0.55), (1.3, -0.55)]])  # along which the node may move
 _FRONT = 700.0  # pixels of a page of 1280 by 720: symbols are before the truss
 _SMALL = 0.02  # of the largest load of a stage: smaller ones have no arrow
 _ALONG = 0.999  # cosine from which a direction is that of the view
@@ -332,15 +320,11 @@ class Actions:
         return loads
 
     def _thinned(self, nodes: np.ndarray, what: str) -> np.ndarray:
-        """Return nodes for symbols, of many those nearest to the middles of the cells of a grid."""
-        some, apart = nodes, _APART * self._diagonal
-        while len(some) > MOST_SYMBOLS:
-            places = (self._start[nodes] - self._centre) / apart
-            order = np.argsort(np.linalg.norm(places - np.round(places), axis=1).round(6), kind="stable")
-            some = nodes[np.sort(order[np.unique(np.round(places[order]), axis=0, return_index=True)[1]])]
-            apart *= 1.1
-        if len(some) == len(nodes):
+        """Return nodes for symbols, of many those nearest to the middles of as many clusters as there may be."""
+        if len(nodes) <= MOST_SYMBOLS:
             return nodes
+        middles, _ = kmeans2(self._start[nodes], _SOME, minit="++", seed=0)
+        some = nodes[np.unique(cKDTree(self._start[nodes]).query(middles)[1])]
         self.notes.append(f"symbols at {len(some):,} of {len(nodes):,} {what} nodes")
         return some
 
@@ -395,20 +379,13 @@ class Actions:
         size, every = _SYMBOL * self._diagonal, 2 if camera.parallel else 3
         upward = np.eye(3)[np.argmax(np.abs(camera.up))] * np.sign(camera.up[np.argmax(np.abs(camera.up))])
         for node, ways in held.items():
-            at = points[node]
-            fixed = len(ways) >= every
+            at, fixed = points[node], len(ways) >= every
             for way in [upward] if fixed else ways:
                 side = way @ upward if abs(way @ upward) > 0.5 else (self._centre - at) @ way
                 away = -way if side >= 0.0 else way
                 across = np.cross(away, camera.towards)
-                across = 0.55 * across / max(float(np.linalg.norm(across)), 1e-300)
-                one, two = at + size * (away + across), at + size * (away - across)
-                lines += [np.array([[at, one], [one, two], [two, at]])]
-                if fixed:
-                    starts = np.linspace(one, two, 5)[:-1]
-                    lines += [np.stack([starts, starts + 0.3 * size * (away - across)], axis=1)]
-                else:
-                    lines += [np.array([[one, two]]) + 0.3 * size * away]
+                axes = np.stack([away, across / max(float(np.linalg.norm(across)), 1e-300)])
+                lines += [at + size * symbol @ axes for symbol in (_TRIANGLE, _STROKES if fixed else _TRACK)]
         return lines
 
 
@@ -499,54 +476,85 @@ def _checked(span: Sequence[float], times: np.ndarray) -> tuple[float, float]:
     return max(first, float(times[0])), min(last, float(times[-1]))
 
 
-class Seen:
-    """A result, parts of which are other ones in pictures.
+class Frames:
+    """A result with other snapshots, or parts, in pictures.
 
     Parameters
     ----------
     result : an open result
+    parts : what is another one, by the names that results have; and what only pictures ask for: ``caption(i)``, the
+        heading of frame i, ``instants(count)``, the frames of a page, ``untrue(scale)``, what displacements are
     """
 
-    def __init__(self, result: Any) -> None:
+    def __init__(self, result: Any, **parts: Any) -> None:
         self._result = result
+        self.__dict__.update(parts)
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._result, name)
 
 
-class Resampled(Seen):
-    """A result at other times: positions and fields are linear between snapshots, and constant outside.
+def resampled(result: Any, times: np.ndarray) -> Frames:
+    """Return a result at other times (n,) [s]: positions and fields are linear between snapshots, constant outside.
+
+    The status of bars is that of the snapshot before.
+    """
+    own = np.asarray(result.times, dtype=float)
+    places = np.interp(times, own, np.arange(len(own)))
+
+    def mixed(values: Callable[[int], np.ndarray], i: int) -> np.ndarray:
+        k, part = int(places[i]), places[i] % 1.0
+        before = np.asarray(values(k), dtype=float)
+        return before + part * (values(k + 1) - before) if part >= 1e-9 else before
+
+    def field(name: str, i: int) -> np.ndarray:
+        return result.field(name, int(places[i])) if name == "status" else mixed(lambda k: result.field(name, k), i)
+
+    return Frames(result, times=np.asarray(times), positions=lambda i: mixed(result.positions, i), field=field)
+
+
+def mode_frames(result: Any, modes: Sequence[int] | None = None, period: int = PERIOD) -> Frames:
+    """Return modes as the snapshots of a result that :func:`~pfem_petsc.post.render.render` draws, a period each.
+
+    The field ``amplitude`` is the length of a node's displacement relative to the largest.
 
     Parameters
     ----------
     result : an open result
-    times : (n,) [s]
+    modes : numbers of the modes from 1; None: all
+    period : frames of a period
+
+    Raises
+    ------
+    InputError
+        Where the result has no modes, or not these.
     """
-
-    def __init__(self, result: Any, times: np.ndarray) -> None:
-        super().__init__(result)
-        self.times = np.asarray(times, dtype=float)
-        own = np.asarray(result.times, dtype=float)
-        place = np.interp(self.times, own, np.arange(len(own)))
-        self._before = np.minimum(place.astype(int), len(own) - 1)
-        self._part = place - self._before
-
-    def positions(self, i: int) -> np.ndarray:
-        """Positions (nodes, 3) [m] at a time."""
-        return self._mixed(lambda k: np.asarray(self._result.positions(k), dtype=float), i)
-
-    def field(self, name: str, i: int) -> np.ndarray:
-        """A field at a time; the status of bars is that of the snapshot before."""
-        if name in _STEPWISE:
-            return self._result.field(name, int(self._before[i]))
-        return self._mixed(lambda k: np.asarray(self._result.field(name, k), dtype=float), i)
-
-    def _mixed(self, values: Callable[[int], np.ndarray], i: int) -> np.ndarray:
-        k, part = int(self._before[i]), float(self._part[i])
-        if part < 1e-9:
-            return values(k)
-        before = values(k)
-        return before + part * (values(k + 1) - before)
+    if period < 4:
+        raise InputError(f"render: {period} frames a period are too few for modes; give 4 or more")
+    found = result.modes
+    numbers = list(range(1, len(found) + 1)) if modes is None else list(modes)
+    for number in numbers:
+        if not 1 <= number <= len(found):
+            raise InputError(f"render: mode {number} does not exist; the result holds modes 1 to {len(found)}")
+    labels, place = [found.label(number - 1) for number in numbers], result.positions(-1)
+    shapes = found.shape[np.array(numbers, dtype=int) - 1]
+    sizes = np.linalg.norm(shapes, axis=2)
+    amplitudes = sizes / sizes.max(axis=1)[:, None]
+    extent = float(np.linalg.norm(np.ptp(place, axis=0))) or 1.0
+    shapes = shapes * (_LARGEST * extent / sizes.max(axis=1))[:, None, None]
+    phases = np.sin(2.0 * np.pi * np.arange(period) / period)
+    return Frames(
+        result,
+        point_fields=("amplitude",),
+        cell_fields=(),
+        axis=MODE,
+        times=np.full(period * len(numbers), result.times[-1]),  # walls are where they are at the end
+        positions=lambda i: place + phases[i % period] * shapes[i // period],
+        field=lambda name, i: amplitudes[i // period] if name == "amplitude" else result.field(name, -1),
+        untrue=lambda scale: f"largest displacement drawn as {scale * _LARGEST:g} of the extent",
+        caption=lambda i: labels[i // period],
+        instants=lambda count: [period * mode + period // 4 for mode in range(min(count, len(numbers)))],
+    )
 
 
 def drawn_radii(result: Any, note: Callable[[str], None] | None = None) -> np.ndarray | None:
@@ -576,69 +584,6 @@ def _lengths(result: Any) -> np.ndarray:
     """Return the length of each bar (bars,) in the first snapshot [m]."""
     start, bars = np.asarray(result.positions(0), dtype=float), np.asarray(result.bars)
     return np.linalg.norm(start[bars[:, 1]] - start[bars[:, 0]], axis=1)
-
-
-class ModeFrames(Seen):
-    """Modes as the snapshots of a result that :func:`~pfem_petsc.post.render.render` draws, a period each.
-
-    The field ``amplitude`` is the length of a node's displacement relative to the largest.
-
-    Parameters
-    ----------
-    result : an open result
-    modes : numbers of the modes from 1; None: all
-    period : frames of a period
-
-    Raises
-    ------
-    InputError
-        Where the result has no modes, or not these.
-    """
-
-    point_fields: Sequence[str] = ("amplitude",)
-    cell_fields: Sequence[str] = ()
-    axis: Axis = MODE
-
-    def __init__(self, result: Any, modes: Sequence[int] | None = None, period: int = PERIOD) -> None:
-        super().__init__(result)
-        if period < 4:
-            raise InputError(f"render: {period} frames a period are too few for modes; give 4 or more")
-        found = result.modes
-        self._numbers = list(range(1, len(found) + 1)) if modes is None else list(modes)
-        for number in self._numbers:
-            if not 1 <= number <= len(found):
-                raise InputError(f"render: mode {number} does not exist; the result holds modes 1 to {len(found)}")
-        self._labels, self._period = [found.label(number - 1) for number in self._numbers], period
-        self._place = result.positions(-1)
-        shapes = found.shape[np.array(self._numbers, dtype=int) - 1]
-        sizes = np.linalg.norm(shapes, axis=2)
-        largest = sizes.max(axis=1)
-        self._amplitudes = sizes / largest[:, None]
-        extent = float(np.linalg.norm(np.ptp(self._place, axis=0))) or 1.0
-        self._shapes = shapes * (_LARGEST * extent / largest)[:, None, None]
-        # walls are where they are at the end
-        self.times = np.full(period * len(self._numbers), result.times[-1])
-
-    def positions(self, i: int) -> np.ndarray:
-        """Positions (nodes, 3) [m] of frame i."""
-        mode, phase = divmod(i, self._period)
-        return self._place + np.sin(2.0 * np.pi * phase / self._period) * self._shapes[mode]
-
-    def field(self, name: str, i: int) -> np.ndarray:
-        """The amplitudes (nodes,) of frame i, and what bars have in all snapshots."""
-        return self._amplitudes[i // self._period] if name == "amplitude" else self._result.field(name, -1)
-
-    def untrue(self, scale: float) -> str:
-        """What displacements are, as they are no true ones."""
-        return f"largest displacement drawn as {scale * _LARGEST:g} of the extent"
-
-    def caption(self, i: int) -> str:
-        """The caption of frame i."""
-        return self._labels[i // self._period]
-
-    def instants(self, count: int) -> list[int]:
-        """Frames for a page: the first modes where they are largest."""
-        return [self._period * mode + self._period // 4 for mode in range(min(count, len(self._numbers)))]
 
 
 def plane(wall: Any, bounds: np.ndarray) -> Surface:

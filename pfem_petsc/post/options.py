@@ -16,6 +16,7 @@ WINDOW = 0.01
 """Window of strain of a crush test, unless one is given."""
 
 SHOWN = ("supports", "loads")
+MARKED = ("broken", "yielded")
 STYLES = ("auto", "tubes", "lines")
 VIDEOS = {
     "mp4": ("mp4",),
@@ -159,6 +160,7 @@ class Options:
             ("video", video, VIDEOS),
             ("style", self.style, STYLES),
             *(("show", each, SHOWN) for each in self.show),
+            *(("mark", each, MARKED) for each in self.marks),
         ]
         for name, value, known in given:
             if value not in known:

@@ -12,9 +12,10 @@ from matplotlib import rc_context
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
+from matplotlib.font_manager import FontProperties
 from matplotlib.lines import Line2D
-from matplotlib.text import Text
 from matplotlib.ticker import MaxNLocator
+from mpl_toolkits.axes_grid1.anchored_artists import AnchoredSizeBar
 
 from ..errors import InputError
 from ..output.table import select
@@ -230,7 +231,7 @@ class Heading(NamedTuple):
 class Page:
     """Frame of a picture: drawings in tiles of a figure of matplotlib, with texts, axes and curves around them.
 
-    Places in the figure are inches, of which one has a hundred pixels of a page of 1280 by 720.
+    An inch has a hundred pixels of a page of 1280 by 720.
 
     Parameters
     ----------
@@ -238,7 +239,7 @@ class Page:
     heading : texts and colours
     captions : above the drawings, one for each; a single drawing has none
     columns : of the drawings
-    inset : width over height of the truss where a curve is beside or below each drawing; 0: there is none
+    inset : whether a curve is below each drawing
 
     Attributes
     ----------
@@ -252,45 +253,49 @@ class Page:
         heading: Heading,
         captions: Sequence[str] = ("",),
         columns: int = 1,
-        inset: float = 0.0,
+        inset: bool = False,
     ) -> None:
         self._figure = figure = _figure(size, 0.0 if heading.transparent else 1.0)
-        self._inches, self._channels = figure.dpi_scale_trans, 4 if heading.transparent else 3
+        self._channels, self._notes = 4 if heading.transparent else 3, heading.notes
         # the marker on a curve, (rows,) times [s], and (rows, 2) where the marker is then
         self._insets: list[tuple[Line2D, np.ndarray, np.ndarray]] = []
         wide, high = figure.get_size_inches()
         left, top, width, height = self.region_of(size)
         rows, strip = -(-len(captions) // columns), round(34 * _unit_of(size)) if len(captions) > 1 else 0
-        tile = width // columns, height // rows - strip
-        self._room = inset_room(tile, inset, round(_CURVE_WIDTH * _unit_of(size))) if inset else (0, 0)
-        beside, below = self._room
-        self.tile = tile[0] - beside, tile[1] - below
-        low, upper = 1.0 - (top + height - below) / size[1], 1.0 - (top + strip) / size[1]
-        edges = {"left": left / size[0], "right": (left + width - beside) / size[0], "bottom": low, "top": upper}
-        places = {**edges, "wspace": beside / self.tile[0], "hspace": (strip + below) / self.tile[1]}
-        tiles = figure.subplots(rows, columns, squeeze=False, gridspec_kw=places).ravel()
+        across, along = width // columns, height // rows - strip
+        least = round(_CURVE_WIDTH * _unit_of(size))
+        if inset and (across < least or along < 1.2 * least):
+            raise InputError(
+                f"render: inset needs tiles of {least} x {round(1.2 * least)} pixels or more, and these have "
+                f"{across} x {along}: give a larger size, or fewer results"
+            )
+        below = round(max(0.6 * least, 0.3 * along)) if inset else 0
+        self.tile, self._below = (across, along - below), below
+        edges = {"left": left / size[0], "right": (left + width) / size[0], "wspace": 0.0}
+        edges |= {"bottom": 1.0 - (top + height - below) / size[1], "top": 1.0 - (top + strip) / size[1]}
+        place = {**edges, "hspace": (strip + below) / self.tile[1]}
+        tiles = figure.subplots(rows, columns, squeeze=False, gridspec_kw=place).ravel()
         self.tiles = tiles[: len(captions)].tolist()
         self._triad = figure.add_axes((1.0 - 1.48 / wide, 0.06 / high, 1.12 / wide, 1.12 / high))
         self._triad.set(xlim=(-1.65, 1.65), ylim=(-1.65, 1.65))
         for axes in (*tiles, self._triad):
             axes.axis("off")
+        letters = across / _unit_of(size) / 11.0
         for axes, caption in zip(self.tiles, captions, strict=True):
-            text = axes.set_title(literal(caption), loc="left", color=INK, fontsize=14.5, pad=8.0)
             head, comma, time = caption.rpartition(", ")  # long names of results are cut, and times are not
-            while head and text.get_window_extent().width > self.tile[0] - 12.0 * _unit_of(size):
-                head = head[:-1]
-                text.set_text(literal(f"{head.rstrip()}…{comma}{time}"))
-        letters = max(4, int((width / _unit_of(size) - 230) / 10.5))  # space for the time is left empty
-        title = heading.title if len(heading.title) <= letters else heading.title[: letters - 1].rstrip() + "…"
-        self._write(0.2, high - 0.38, literal(title), fontsize=16, weight="bold")
-        self._time = self._write(wide - 1.5, high - 0.41, "", ha="right")
+            text = cut(head, letters - len(time)) + comma + time
+            axes.set_title(literal(text), loc="left", color=INK, fontsize=14.5, pad=8.0)
+        title = cut(heading.title, (width / _unit_of(size) - 230) / 10.5)  # space for the time is left empty
+        figure.text(0.2 / wide, 1.0 - 0.38 / high, literal(title), color=INK, fontsize=16, weight="bold")
+        self._time = figure.text(1.0 - 1.5 / wide, 1.0 - 0.41 / high, "", color=INK, fontsize=14.5, ha="right")
+        self._foot = figure.text(0.34, 0.22 / high, "", color=INK, fontsize=11.5, va="center", linespacing=1.1)
         keys = [
             Line2D([], [], color=np.divide(mark.colour, 255), linewidth=4, label=mark.text) for mark in heading.marks
         ]
-        place: dict[str, Any] = {"loc": "lower right", "bbox_to_anchor": (1.0 - 1.5 / wide, 0.0)}
-        figure.legend(handles=keys, frameon=False, fontsize=11.5, ncols=max(1, len(keys)), **place)
-        self._notes = heading.notes
-        self._foot = self._write(0.24, 0.22, "", va="center", fontsize=11.5, linespacing=1.1)
+        corner = (1.0 - 1.5 / wide, 0.0)
+        figure.legend(
+            handles=keys, frameon=False, fontsize=11.5, ncols=len(keys) or 1, loc="lower right", bbox_to_anchor=corner
+        )
         scale = heading.scale
         bar = figure.add_axes((1.0 - 1.16 / wide, 1.6 / high, 0.2 / wide, 1.0 - 2.91 / high))
         figure.colorbar(scale.shown, cax=bar, ticks=MaxNLocator(nbins=7, steps=[1, 2, 2.5, 5, 10]))
@@ -346,24 +351,20 @@ class Page:
             canvas.draw()
         return np.asarray(canvas.buffer_rgba())[..., : self._channels].copy()
 
-    def _write(self, x: float, y: float, text: str, **style: Any) -> Text:
-        """Write a text on a baseline at a place."""
-        return self._figure.text(x, y, text, transform=self._inches, **{"color": INK, "fontsize": 14.5, **style})
-
     def add_length_scale(self, camera: Camera) -> None:
         """Draw a line of 1, 2 or 5 times a power of ten, and its length; with perspective, it is that at mid-depth."""
         metres = 2.0 * camera.half_height / self.tile[1]
         length = float(MaxNLocator(9, steps=[1, 2, 5, 10]).tick_values(0.0, metres * self.tile[0])[1])
-        end = 0.24 + length / metres / self._figure.dpi
-        style = {"color": PALE, "linewidth": 1.0, "marker": "|", "markersize": 8}
-        self._figure.add_artist(Line2D([0.24, end], [0.22, 0.22], transform=self._inches, **style))
         factor, name = prefix_for(length, "m")
         text = f"{length * factor:g} {name}" + ("" if camera.parallel else " at mid-depth")
-        self._write(end + 0.1, 0.22, text, color=PALE, va="center_baseline", fontsize=11.5)
-        self._foot.set_x(end + 0.4 + 0.085 * len(text))
+        look = {"loc": "lower left", "frameon": False, "color": PALE, "fontproperties": FontProperties(size=11.5)}
+        place = {"bbox_to_anchor": self._figure.bbox, "borderpad": 0.5, "sep": 3.0, "fill_bar": True}
+        inches = length / metres / self._figure.dpi
+        bar = AnchoredSizeBar(self._figure.dpi_scale_trans, inches, text, size_vertical=0.02, **look, **place)
+        self._figure.add_artist(bar)
 
     def add_insets(self, results: Sequence[Any], name: str) -> None:
-        """Add a curve of the history to the room of each drawing, with a marker, which :meth:`draw` moves.
+        """Add a curve of the history below each drawing, with a marker, which :meth:`draw` moves.
 
         Parameters
         ----------
@@ -371,33 +372,30 @@ class Page:
         name : of a column, see :func:`history_curve`
         """
         curves = [(np.asarray(r.history["time"], dtype=float), history_curve(r.history, name)) for r in results]
-        chosen = select(results[0].history, name)
+        chosen, axis = select(results[0].history, name), results[0].axis
         factor, unit = prefix_for(max(largest(values) for _, values in curves), chosen.unit or "")
-        axis = results[0].axis
         time_factor, time_unit = axis.scale(max(largest(times) for times, _ in curves))
         kind, *parts, last = name.split("/") if "/" in name and chosen.single else ("", name)
         label = (f"{kind} '{'/'.join(parts)}', {last}" if parts else last).replace("_", " ")
-        high = self._room[1] or round(min(0.62 * self._room[0], self.tile[1]))
-        wide = self._room[0] or min(3 * high, self.tile[0])
-        left, bottom = (0.0, -high) if self._room[1] else (self.tile[0], 0.5 * (self.tile[1] - high))
-        pixel = high / self._figure.dpi / 1.8
-        margin = 34.0 * pixel * self._figure.dpi / 100.0, 40.0 * pixel * self._figure.dpi / 100.0  # of labels
-        inside = left + 1.4 * margin[0], bottom + margin[1], wide - 2.0 * margin[0], high - 1.7 * margin[1]
-        place = np.array(inside) / np.tile(self.tile, 2)
-        with rc_context({**STYLE, "font.size": 8.0 * pixel, "axes.titlesize": 8.5 * pixel}):
+        share = self._below / self.tile[1]
+        place, shared = (0.08, -0.76 * share, 0.88, 0.54 * share), None
+        with rc_context({**STYLE, "font.size": 9.0, "axes.titlesize": 9.5}):
             for tile, (times, values) in zip(self.tiles, curves, strict=True):
-                axes = tile.inset_axes(place)
-                axes.patch.set_alpha(0.88)
-                for others, shown in curves:  # for the range
-                    axes.plot(others * time_factor, shown * factor, alpha=0.0)
+                shared = axes = tile.inset_axes(place, sharex=shared, sharey=shared)
                 curve = np.stack([times * time_factor, values * factor], axis=1)
                 axes.plot(*curve.T, color=_CURVE)
+                (marker,) = axes.plot([], [], "o", color=_MARKER, markersize=6.0)
                 axes.locator_params(nbins=5)
                 axes.set_xlabel(axis.label(time_unit), labelpad=1.0)
                 axes.margins(y=0.08)
                 axes.set_title(literal(label + (f" [{unit}]" if unit else "")))
-                (marker,) = axes.plot([], [], "o", color=_MARKER, markersize=6 * pixel)
                 self._insets.append((marker, times, curve))
+
+
+def cut(text: str, letters: float) -> str:
+    """Return a text of at most some letters, but four."""
+    most = max(4, int(letters))
+    return text if len(text) <= most else text[: most - 1].rstrip() + "…"
 
 
 def _draw_ways(
@@ -431,32 +429,6 @@ def history_curve(history: Any, name: str) -> np.ndarray:
     return found[name] if name in found else column(history, f"({name}).norm")[f"({name}).norm"]
 
 
-def inset_room(tile: tuple[int, int], aspect: float, least: int) -> tuple[int, int]:
-    """Return the width or the height of a strip for a curve, beside or below a drawing: what leaves more for the truss.
-
-    Parameters
-    ----------
-    tile : width and height of the drawing and the strip in pixels
-    aspect : width of the truss over its height
-    least : width of a legible curve
-
-    Raises
-    ------
-    InputError
-        If the drawings are too small.
-    """
-    (width, height), lowest = tile, round(0.6 * least)
-    beside, below = max(least, round(0.27 * width)), max(lowest, round(0.3 * height))
-    if width < least or height < 2 * lowest:
-        raise InputError(
-            f"render: inset needs tiles of {least} x {2 * lowest} pixels or more, and these have {width} x {height}: "
-            "give a larger size, or fewer results"
-        )
-    if min(width, aspect * (height - below)) >= min(width - beside, aspect * height):
-        return 0, below
-    return beside, 0
-
-
 def grid(count: int, aspect: float, room: tuple[int, int]) -> tuple[int, int]:
     """Return the columns and rows of tiles that make pictures of this aspect (width over height) largest."""
 
@@ -488,26 +460,22 @@ def mesh_page(mesh: WholeMesh, size: tuple[int, int] = (1280, 720), view: str = 
     for k, members in reversed(list(enumerate(mesh.bar_groups.values()))[: len(_GROUPS)]):
         group[members] = k
     shown = np.unique(group).tolist() if mesh.bar_groups else []
-    figure = _figure(size)
-    figure.set_layout_engine("constrained")
-    axes = figure.subplots()
+    figure, bounds = _figure(size), np.array([points.min(axis=0), points.max(axis=0)])
+    axes = figure.add_axes((0.02, 0.09, 0.96, 0.78 if shown else 0.89))
     axes.axis("off")
-    bounds = np.array([points.min(axis=0), points.max(axis=0)])
     span = " x ".join(f"{x:.4g}" for x in bounds[1] - bounds[0])
     text = f"{len(points):,} nodes, {len(mesh.bars):,} bars, {span} m"
-    figure.supxlabel(text, x=0.02, ha="left", fontsize=15, color=INK)
+    figure.text(0.02, 0.025, text, fontsize=15, color=INK)
     palette = np.array([to_rgb(colour) for colour in (*_GROUPS, _OTHERS)])
-    if shown:
-        names = [n if len(n) <= _LETTERS else f"{n[: _LETTERS - 1]}…" for n in list(mesh.bar_groups)[: len(_GROUPS)]]
-        texts = [names[number] if number < len(names) else "other bars" for number in shown]
-        handles = [Line2D([], [], color=palette[number], linewidth=4) for number in shown]
-        place: dict[str, Any] = {"loc": "lower center", "bbox_to_anchor": (0.5, 1.0), "frameon": False}
-        axes.legend(handles, texts, ncols=max(1, round(figure.get_figwidth() / 3.1)), fontsize=15, **place)
-    figure.draw_without_rendering()  # which gives the axes their place
+    names = [*(cut(name, _LETTERS) for name in list(mesh.bar_groups)[: len(_GROUPS)]), "other bars"]
+    handles = [
+        Line2D([], [], color=palette[number], linewidth=4, label=names[min(number, len(names) - 1)]) for number in shown
+    ]
+    figure.legend(handles=handles, ncols=4, fontsize=15, loc="upper center", frameon=False)
     wide, high = axes.bbox.size.astype(int).tolist()
     camera = fit(points, direction(view, bounds, [], (0.0, 0.0, 1.0)), wide / high)
     motion = SimpleNamespace(start=points, bars=mesh.bars, bounds=bounds)
-    scene = Scene(motion, camera, (wide, high), Style(tubes=False, rims=False), unit=_unit_of(size))
+    scene = Scene(motion, camera, (wide, high), Style(rims=False), unit=_unit_of(size))
     picture = scene.draw(points, (255.0 * palette[group]).astype(np.uint8), camera)
     scene.close()
     figure.figimage(picture, *axes.bbox.min.round(), origin="upper")

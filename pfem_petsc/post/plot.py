@@ -5,12 +5,13 @@ from __future__ import annotations
 import itertools
 import re
 import textwrap
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.ndimage import binary_dilation
 
 from ..case.base import StrictModel
 from ..columns import SUPPLIED
@@ -22,7 +23,6 @@ from ..output.units import engineering, prefix_for, unit_of
 from .chart import COLOURS, DASHES, REFERENCE, STYLE, Chart, Curve, Panel, area, distinct, largest, opened
 from .curves import (
     AS_COMPUTED,
-    CLOSED_FORM,
     ClosedForm,
     Filter,
     History,
@@ -72,11 +72,6 @@ WINDOW = 0.02  # width of the moving average of forces, relative to the run
 
 _ROUNDING = 1e-9
 """Change of a curve below which it is constant, relative to the largest number of its unit in the picture."""
-
-_MOMENTA = ("momentum", "angular_momentum")
-
-_QUANTITIES = ("displacement", "velocity", "reaction")
-"""Of probes that have panels; accelerations in impacts are mostly noise."""
 
 
 def plot(result_path: Path | str | Any | Sequence[Any], output: Path | str | None = None, **options: Any) -> list[Path]:
@@ -151,20 +146,20 @@ def _usual(
     forces = chosen or _usual_filter(result)
     drawn = {
         "energies": energies(history, exact),
-        "momentum": momentum(history, exact) if result.stretches else ([], "", 1),
-        "probes": probes(history, exact),
-        "bars": bars(history),
+        "momentum": momentum(result, exact) if result.stretches else ([], ""),
+        "probes": probes(result, exact),
+        "bars": bars(result),
         "walls": force_panels(result, "wall", forces, exact),
         "pairs": force_panels(result, "pair", forces),
         "constraints": force_panels(result, "constraint", forces),
-        "force_displacement": (force_displacement(result, forces, exact), "", 1),
-        "solver": (solver(history), "", 1),
+        "force_displacement": (force_displacement(result, forces, exact), ""),
+        "solver": (solver(result), ""),
     }
     written = []
-    for name, (panels, note, columns) in drawn.items():
+    for name, (panels, note) in drawn.items():
         if panels:
             ends = result.stage_ends if result.axis.staged else ()
-            chart = Chart(panels, title, read(history, "time"), result.axis, columns, note, ends)
+            chart = Chart(panels, title, read(history, "time"), result.axis, note, ends)
             written += chart.save(folder / name, suffixes)
     if "csv" in suffixes and hasattr(result, "table"):
         written.append(result.table().to_csv(folder / "history.csv"))
@@ -178,14 +173,14 @@ def _free(file: Path, suffixes: Sequence[str]) -> Path:
     return next(free)
 
 
-def energies(history: History, exact: ClosedForm | None = None) -> tuple[list[Panel], str, int]:
+def energies(history: History, exact: ClosedForm | None = None) -> tuple[list[Panel], str]:
     """Stacked stored and lost energies with what was supplied, the terms one by one, and the balance.
 
-    Each picture is panels, and may have a note below them and a number of columns.
+    Each picture is panels, and may have a note below them.
     """
     error = balance_error(history)
     if error is None:
-        return [], "", 1
+        return [], ""
     held = energies_of(history)
     most = max(float(np.nanmax(np.abs(values))) for values in held.values())
     moving = {name: values for name, values in held.items() if np.abs(values).max() > 1e-12 * most}
@@ -207,140 +202,104 @@ def energies(history: History, exact: ClosedForm | None = None) -> tuple[list[Pa
     lines = [Curve(words(name), values, distinct(number[name]), name) for name, values in moving.items()]
     lines += exact_curves(exact, list(moving))
     # a share of the largest energy, so that neither a prefix nor a unit hides how small it is
-    worst = float(np.nanmax(np.abs(error))) / (most or 1.0)
-    told = f"at most {worst:.1e}\nof {engineering(most, 'J')}" if worst > 0.0 else "zero"
-    share = (1.0 / most, "") if most > 0.0 else (1.0, "J")
+    share, worst = (1.0 / (most or 1.0), ""), float(np.nanmax(np.abs(error)))
+    told = f"at most {worst * share[0]:.1e}\nof {engineering(most, 'J')}" if worst > 0.0 else "zero"
     balance = Curve(told, error, {"color": COLOURS[1]}, "balance error")
     panels = [
         Panel("stored and lost,\nstacked", "J", [*areas, *sums], "", 1.3),
         Panel("energy", "J", lines, "", 1.3),
         Panel("balance error,\nshare of largest", "J", [balance], "", 0.7, scale=share),
     ]
-    return panels, f"Zero throughout: {', '.join(still)}." if still else "", 1
+    return panels, f"Zero throughout: {', '.join(still)}." if still else ""
 
 
-def momentum(history: History, exact: ClosedForm | None = None) -> tuple[list[Panel], str, int]:
+def momentum(result: Any, exact: ClosedForm | None = None) -> tuple[list[Panel], str]:
     """Momentum, angular momentum and the displacement of the centre of mass, without those that do not change."""
-    panels = {words(name): _vector(history, name, words(name), exact) for name in _MOMENTA if name in history}
+    history, scales = result.history, {}
+    names = {words(name): name for name in ("momentum", "angular_momentum") if name in history}
     if "centre_of_mass" in history:
-        label = "centre of mass,\nmoved by"
-        panels[label] = _vector(history, "centre_of_mass/displacement", label, exact)
-    scales = {}
-    if len(panels) == 3:
+        names["displacement of the centre of mass"] = "centre_of_mass/displacement"
+    if len(names) == 3:
         arm = np.linalg.norm(read(history, "centre_of_mass"), axis=1)
         scales["angular momentum"] = largest(arm * np.linalg.norm(read(history, "momentum"), axis=1))
-    shown, note = _moving(panels, scales)
-    return (shown if any(panel.size > 0.0 for panel in shown) else []), note, 1
+    shown, note = _moving(result, names, scales, exact)
+    return (shown if any(panel.size > 0.0 for panel in shown) else []), note
 
 
-def probes(history: History, exact: ClosedForm | None = None) -> tuple[list[Panel | None], str, int]:
-    """Displacement, velocity and reaction of each probe, a row each, without those that do not change."""
-    found = {name.removeprefix("probe/").rpartition("/")[0]: None for name in history if name.startswith("probe/")}
-    panels, scales = {}, {}
-    for probe, quantity in itertools.product(found, _QUANTITIES):
-        source = f"probe/{probe}/{'position' if quantity == 'displacement' else quantity}"
-        if source not in history:
-            continue
-        key, values = f"{quantity} of {probe}", read(history, source)
-        count = values.shape[1]
-        panel = _vector(history, f"probe/{probe}/{quantity}", quantity, exact)
-        panel.title = f"{probe}, {'sum' if quantity == 'reaction' else 'mean'} of {count} nodes" if count > 1 else probe
-        if quantity == "displacement":
-            scales[key] = 1e-3 * largest(values)
-            values = values - values[:1]
-        if count > 1 and quantity != "reaction":
-            for curve in list(panel.curves)[: len(column(history, f"probe/{probe}/{quantity}"))]:
-                part = values[:, :, "xyz".index(curve.name)]
-                bounds = np.stack([part.min(axis=1), part.max(axis=1)], axis=1)
-                panel.curves.append(Curve("", bounds, {"color": curve.style["color"], "alpha": 0.15}, kind="band"))
-        panels[key] = panel
-    shown, note = _moving(panels, scales)
-    if any(curve.kind == "band" for panel in shown for curve in panel.curves):
-        note = f"Shaded: the range of the nodes. {note}".strip()
-    if len(found) < 2 or len(shown) < 3:
-        return shown, note, 1
-    keys = {(panel.title.partition(",")[0], panel.label): panel for panel in shown}
-    rows, columns = (list(dict.fromkeys(names)) for names in zip(*keys, strict=True))
-    return [keys.get(place) for place in itertools.product(rows, columns)], note, len(columns)
+def probes(result: Any, exact: ClosedForm | None = None) -> tuple[list[Panel], str]:
+    """Displacement, velocity and reaction of each probe, without those that do not change."""
+    names, scales, history = {}, {}, result.history
+    found = dict.fromkeys(
+        name.removeprefix("probe/").rpartition("/")[0] for name in history if name.startswith("probe/")
+    )
+    for probe, quantity in itertools.product(found, ("position", "velocity", "reaction")):
+        source = f"probe/{probe}/{quantity}"
+        if source in history:
+            name = f"{'displacement' if quantity == 'position' else quantity} of {probe}"
+            names[name] = source.replace("/position", "/displacement")
+            scales[name] = 1e-3 * largest(read(history, source)) if quantity == "position" else 0.0
+    return _moving(result, names, scales, exact)
 
 
-def bars(history: History) -> tuple[list[Panel], str, int]:
+def bars(result: Any) -> tuple[list[Panel], str]:
     """Axial force and stress of the bars of each probe."""
-    panels = []
-    names = [name for name in history if name.startswith("bar/") and not name.endswith("/strain")]
-    for name in names:
-        probe, quantity = name.removeprefix("bar/").rsplit("/", 1)
-        values = read(history, name)
-        title, bounds = probe, np.stack([values.min(axis=1), values.max(axis=1)], axis=1)
-        curves = [Curve("", values.mean(axis=1), {"color": COLOURS[0]}, name)]
-        if values.shape[1] > 1:
-            title = f"{probe}, mean of {values.shape[1]} bars"
-            curves.append(Curve("", bounds, {"color": COLOURS[0], "alpha": 0.15}, kind="band"))
-        panels.append(Panel(words(quantity), unit_of(name), curves, title, 0.9, legend=False))
-    several = any(len(panel.curves) > 1 for panel in panels)
-    return panels, "Shaded: the range of the bars." if several else "", 2
+    names = [name for name in result.history if name.startswith("bar/") and not name.endswith("/strain")]
+    panels = curve_panels([result], [(name, None) for name in names])
+    return panels, _SHADED if any(len(panel.curves) > 1 for panel in panels) else ""
 
 
-def _vector(history: History, name: str, label: str, exact: ClosedForm | None) -> Panel:
-    """Return the panel of the components of a column that are not zero."""
-    curves = [
-        Curve(part[-1], values, {"color": COLOURS["xyz".index(part[-1])]}, part)
-        for part, values in column(history, name).items()
-    ]
-    curves += exact_curves(exact, [curve.key for curve in curves])
-    return Panel(label, unit_of("position" if "displacement" in name else name), curves)
+_SHADED = "Shaded: the range of the nodes or bars."
 
 
-def _moving(panels: dict[str, Panel], scales: dict[str, float]) -> tuple[list[Panel], str]:
-    """Return the panels whose curves change, or all if none does, and a note that names the others.
+def _moving(
+    result: Any, names: Mapping[str, str], scales: Mapping[str, float], exact: ClosedForm | None
+) -> tuple[list[Panel], str]:
+    """Return the panels of columns that change, or of all if none does, and a note that names the others.
 
     Rounding is relative to the largest number of the unit, or to the ``scales`` of numbers that values are
     differences of.
     """
     shown, still = [], []
+    panels = dict(zip(names, curve_panels([result], [(name, None) for name in names.values()], exact), strict=True))
     for name, panel in panels.items():
         scale = max([scales.get(name, 0.0), *(other.size for other in panels.values() if other.unit == panel.unit)])
         curves = [np.nan_to_num(curve.values) for curve in panel.curves]
         if max(float(np.ptp(values, axis=0).max()) for values in curves) > _ROUNDING * scale:
             shown.append(panel)
         else:
-            means = {curve.name: float(np.mean(curve.values)) for curve in panel.curves if curve.name in tuple("xyz")}
+            means = {curve.key[-1]: float(np.mean(curve.values)) for curve in panel.curves if curve.kind == "line"}
             parts = ", ".join(f"{part} = {mean:.4g}" for part, mean in means.items() if abs(mean) > _ROUNDING * scale)
             still.append(f"{name} ({parts} {panel.unit})" if parts else f"{name} (zero)")
-    if not shown:
-        return list(panels.values()), ""
-    return shown, f"Constant: {', '.join(still)}." if still else ""
+    note = f"Constant: {', '.join(still)}." if still and shown else ""
+    shown = shown or list(panels.values())
+    shaded = any(curve.kind == "band" for panel in shown for curve in panel.curves)
+    return shown, f"{_SHADED} {note}".strip() if shaded else note
 
 
-def solver(history: History) -> list[Panel]:
+def solver(result: Any) -> list[Panel]:
     """The iterations of the steps, and the nodes in contact where no other picture has them."""
-    labels = {"newton_iterations": "Newton\niterations", "linear_iterations": "linear\niterations"}
-    labels["active_contacts"] = "nodes in\ncontact"
-    names = [name for name in labels if name in history]
-    # without iterations (explicit schemes) or without walls these panels would be empty
+    history = result.history
+    names = [name for name in ("newton_iterations", "linear_iterations") if np.any(history.get(name, 0))]
     contacts = [name for name in history if name.startswith("wall/") and name.endswith("/contacts")]
-    names = [name for name in names if (contacts and name == "active_contacts") or np.any(history[name])]
-    single = len(contacts) == 1 and np.array_equal(history[contacts[0]], history["active_contacts"])
-    if names == ["active_contacts"] and single:  # which is in the picture of the walls
-        return []
-    panels = []
-    for name in names:
-        kind = "steps before" if name.endswith("_iterations") else "steps"
-        curve = Curve("", history[name], {"color": COLOURS[len(panels)]}, " ".join(labels[name].split()), kind=kind)
-        panels.append(Panel(labels[name], "", [curve], height=0.7, legend=False))
+    shown = len(contacts) == 1 and np.array_equal(history[contacts[0]], history["active_contacts"])  # with the walls
+    names += ["active_contacts"] if contacts and (names or not shown) else []
+    panels = curve_panels([result], [(name, None) for name in names])
+    for name, panel in zip(names, panels, strict=True):  # iterations are those of the step before a row
+        style = {"drawstyle": "steps-pre" if name.endswith("iterations") else "steps-post"}
+        panel.curves = [curve._replace(style={**curve.style, **style}) for curve in panel.curves]
     return panels
 
 
 def force_panels(
     result: Any, source: str, smoothing: Filter, exact: ClosedForm | None = None
-) -> tuple[list[Panel], str, int]:
+) -> tuple[list[Panel], str]:
     """The forces of all walls, or of all pairs or constraints, and the nodes in contact where they are counted.
 
     Forces are drawn as computed and filtered; before the run, they are zero. Those of none have a panel only if all do.
     """
-    history, panels = result.history, []
-    names = [name.removeprefix(f"{source}/").removesuffix("/force") for name in history if name.endswith("/force")]
-    names = [name for name in names if f"{source}/{name}/force" in history]
+    history, panels, plain = result.history, [], make_filter("none")
+    forces = [name for name in history if name.startswith(f"{source}/") and name.endswith("/force")]
+    names = [name.removeprefix(f"{source}/").removesuffix("/force") for name in forces]
     felt = [name for name in names if np.any(history[f"{source}/{name}/force"])]
     normals = {wall.name: wall.normal for wall in result.case.every_wall if hasattr(wall, "normal")}
     for name in felt or names:
@@ -348,24 +307,21 @@ def force_panels(
         # pairs and constraints may have the name of a wall
         normal = normals.get(name) if source == "wall" else None
         values, label = _pressing(read(history, key), normal)
-        forms = {AS_COMPUTED: (values, 0.9)}
-        if felt:
-            forms.setdefault(smoothing.name, (smoothed(result, smoothing, values, True), 1.6))
-        for form, (drawn, width) in forms.items():
-            curves = [Curve(form, drawn, {"linewidth": width}, f"{key} {label}, {form}")]
+        forms = [plain, smoothing] if felt and smoothing.name != AS_COMPUTED else [plain]
+        for form in forms:
+            style = {"linewidth": 0.9 if form is plain else 1.6}
+            curves = [Curve(form.name, smoothed(result, form, values, True), style, f"{key} {label}, {form.name}")]
             if exact is not None and key in exact.columns:
-                known = _pressing(exact.columns[key], normal)[0]
-                if form != AS_COMPUTED:
-                    known = smoothed(result, smoothing, known, True)
-                curves.append(Curve(exact.name, known, REFERENCE, f"{key} closed form, {form}"))
+                known = smoothed(result, form, _pressing(exact.columns[key], normal)[0], True)
+                curves.append(Curve(exact.name, known, REFERENCE, f"{key} closed form, {form.name}"))
             panels.append(Panel(label, "N", curves, heading, 0.9))
             heading = ""
         if felt and f"{source}/{name}/contacts" in history:
             counts = history[f"{source}/{name}/contacts"]
-            curve = Curve("", counts, {"color": COLOURS[1]}, f"{source}/{name}/contacts", kind="steps")
+            curve = Curve("", counts, {"color": COLOURS[1], "drawstyle": "steps-post"}, f"{source}/{name}/contacts")
             panels.append(Panel("nodes in\ncontact", "", [curve], height=0.5, legend=False))
     silent = [f"'{name}'" for name in names if felt and name not in felt]
-    return panels, f"No force throughout: {', '.join(silent)}." if silent else "", 1
+    return panels, f"No force throughout: {', '.join(silent)}." if silent else ""
 
 
 def force_displacement(result: Any, smoothing: Filter, exact: ClosedForm | None = None) -> list[Panel]:
@@ -386,11 +342,12 @@ def force_displacement(result: Any, smoothing: Filter, exact: ClosedForm | None 
 
 
 def _path(curves: list[Curve], label: str, unit: str, heading: str, over: str) -> Panel:
-    few = {"marker": "o", "markersize": 3} if len(curves[0].place) < 80 else {}
-    curves[0] = curves[0]._replace(style={"color": COLOURS[0], **few}, key=f"{heading} {label}, {curves[0].name}")
-    for k, curve in enumerate(curves[1:], start=1):
-        curves[k] = curve._replace(style=REFERENCE, key=f"{heading} {label}, closed form", source="closed form")
-    return Panel(label, unit, curves, heading, over=(over, "m"))
+    first, *known = curves
+    few = {"marker": "o", "markersize": 3} if len(first.place) < 80 else {}
+    drawn = [first._replace(style={"color": COLOURS[0], **few}, key=f"{heading} {label}, {first.name}")]
+    key = f"{heading} {label}, closed form"
+    drawn += [curve._replace(style=REFERENCE, key=key, source="closed form") for curve in known]
+    return Panel(label, unit, drawn, heading, over=(over, "m"))
 
 
 def _load_paths(history: History, exact: ClosedForm | None) -> list[Panel]:
@@ -425,7 +382,8 @@ def _wall_path(result: Any, wall: Any, smoothing: Filter, exact: ClosedForm | No
     def path(force: np.ndarray, moved: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return both after the filter, while nodes touch the wall."""
         smooth, moved = smoothed(result, smoothing, force, True), smoothed(result, smoothing, moved)
-        near, begin = _near(force, smooth), max(0, int(np.argmax(force != 0.0)) - 1)
+        felt = (force != 0.0) | (np.abs(smooth) > 1e-3 * largest(smooth))
+        near, begin = binary_dilation(felt), max(0, int(np.argmax(force != 0.0)) - 1)
         shown = slice(np.argmax(near), len(near) - np.argmax(near[::-1]))
         return np.where(near, smooth, np.nan)[shown], (moved - moved[begin])[shown]
 
@@ -435,12 +393,6 @@ def _wall_path(result: Any, wall: Any, smoothing: Filter, exact: ClosedForm | No
         values, along = path(exact.columns[key] @ normal, -exact.columns[place] @ normal)
         curves.append(Curve(exact.name, values, place=along))
     return [_path(curves, "normal force", "N", f"Wall '{wall.name}'", over)]
-
-
-def _near(force: np.ndarray, smooth: np.ndarray) -> np.ndarray:
-    """Return which rows (n,) bool have a force as computed or filtered, or are beside such a row."""
-    felt = (force != 0.0) | (np.abs(smooth) > 1e-3 * largest(smooth))
-    return np.convolve(felt, np.ones(3), mode="same") > 0.0
 
 
 def _usual_filter(result: Any) -> Filter:
@@ -483,63 +435,109 @@ def draw_curves(
     if not panels:
         raise InputError("plot: no curves named; columns: " + ", ".join(results[0].history))
     first = results[0]
-    labels, captions = _labels_and_captions(results, [name for name, _ in panels], labels)
     if len({result.axis.symbol for result in results}) > 1 and against is None:
         raise InputError("plot: the results are over different axes: " + ", ".join({r.axis.symbol for r in results}))
     exact = closed_form(first) if closed_forms and against is None else None
     times = [read(result.history, "time") for result in results]
-    places = times
+    places, over = times, None
     if against is not None:
         found = [column(result.history, against) for result in results]
         if any(list(each) != [against] for each in found):
             raise InputError(f"plot: against = {against!r} is a vector: name a component, {against}.x, .y, .z or .norm")
         places = [_filtered(r, chosen, against, each[against]) for r, each in zip(results, found, strict=True)]
-    shared = all(np.array_equal(place, places[0]) for place in places)
-    over = None if against is None else (against, select(first.history, against).unit or "")
-    columns = {name: [column(result.history, name) for result in results] for name, _ in panels}
-    components = {name: _parts(found) for name, found in columns.items()}
-    split = any(len(parts) > 1 for parts in components.values())
-    drawn = []
-    for (name, smoothing), caption in zip(panels, captions, strict=True):
-        found, parts, whole = columns[name], components[name], select(first.history, name)
-        curves = []
-        for number, (each, label, result, place) in enumerate(zip(found, labels, results, places, strict=True)):
-            for k, part in enumerate(parts):
-                if part not in each:
-                    continue
-                shown = _filtered(result, smoothing, part, each[part])
-                style = _line(number, k, len(results), split)
-                component = part.rpartition(".")[2] if caption else part
-                words_of = (label if len(found) > 1 else "", component if len(parts) > 1 else "")
-                key = f"{part}: {label}" if len(found) > 1 else part
-                key += f", {smoothing.name}" if smoothing is not None and (name, None) in panels else ""
-                text = " ".join(word for word in words_of if word) or caption or "computed"
-                curves.append(Curve(text, shown, style, key, place, "" if shared else label))
-        for known in exact_curves(exact, [part for part in parts if part in found[0]], places[0]):
-            part = known.key.removesuffix(CLOSED_FORM)
-            curves.append(known._replace(values=_filtered(first, smoothing, part, known.values)))
-        title = parts[0] if len(parts) == 1 else name  # which component it is
-        label = caption or quantity_of(name, whole)
-        titles = [title] if not caption and words(title) != label else []
-        if smoothing is not None and smoothing.name != AS_COMPUTED:
-            titles.append(f"{AS_COMPUTED}, as all energies" if _is_energy(whole) else smoothing.name)
-        lines = sum(1 + curve.name.count("\n") for curve in curves)
-        height = max(0.9, 0.11 * lines)  # of the legend
-        drawn.append(Panel(label, whole.unit or "", curves, ": ".join(titles), height, over, None, len(curves) > 1))
+        over = against, select(first.history, against).unit or ""
+    drawn = curve_panels(results, panels, exact, labels, places, over)
     axis = max((result.axis for result in results), key=lambda axis: axis.staged)
     ends = first.stage_ends if len(results) == 1 and axis.staged else ()
     return Chart(drawn, first.case.title or first.case.name, np.concatenate(times), axis, ends=ends)
 
 
+def curve_panels(
+    results: Sequence[Any],
+    panels: Sequence[tuple[str, Filter | None]],
+    exact: ClosedForm | None = None,
+    labels: Sequence[str] | None = None,
+    places: Sequence[np.ndarray] | None = None,
+    over: tuple[str, str] | None = None,
+) -> list[Panel]:
+    """Return panels of columns, with the curves of all results; of one result also the range of nodes or bars.
+
+    Parameters
+    ----------
+    results, panels, labels : as of :func:`draw_curves`
+    exact : closed form of the first result
+    places : of the rows of each result (rows,) on the horizontal axis; None: their times
+    over : name and unit of that axis, as :class:`~pfem_petsc.post.chart.Panel` has it
+    """
+    first, drawn = results[0], []
+    labels, captions = _labels_and_captions(results, [name for name, _ in panels], labels)
+    places = [read(result.history, "time") for result in results] if places is None else places
+    shared = all(np.array_equal(place, places[0]) for place in places)
+    columns = [[column(result.history, name) for result in results] for name, _ in panels]
+    split = any(len(_parts(found)) > 1 for found in columns)
+    for (name, smoothing), caption, found in zip(panels, captions, columns, strict=True):
+        curves, parts, whole = [], _parts(found), select(first.history, name)
+        for number, curve in _curves_of(found, labels, caption, split):
+            key = curve.key + (f", {smoothing.name}" if smoothing is not None and (name, None) in panels else "")
+            values = _filtered(results[number], smoothing, name, curve.values)
+            source = "" if shared else labels[number]
+            curves.append(curve._replace(values=values, key=key, place=places[number], source=source))
+        title = parts[0] if len(parts) == 1 else name  # which component it is
+        label = caption or quantity_of(name, whole)
+        titles = [title] if not caption and words(title) != label else []
+        if smoothing is not None and smoothing.name != AS_COMPUTED:
+            titles.append(f"{AS_COMPUTED}, as all energies" if _is_energy(whole) else smoothing.name)
+        if whole.single and whole.values.ndim == 2 + whole.vector and whole.values.shape[1] > 1:
+            summed = name.endswith("/reaction")
+            titles.append(f"{'sum' if summed else 'mean'} of {whole.values.shape[1]}")
+            curves += _ranges(whole, curves) if len(results) == 1 and smoothing is None and not summed else []
+        for known in exact_curves(exact, [part for part in parts if part in found[0]], places[0]):
+            curves.append(known._replace(values=_filtered(first, smoothing, name, known.values)))
+        lines = sum(1 + curve.name.count("\n") for curve in curves)
+        height = max(0.9, 0.11 * lines)  # of the legend
+        legend = sum(curve.kind == "line" for curve in curves) > 1
+        drawn.append(Panel(label, whole.unit or "", curves, ": ".join(titles), height, over, None, legend))
+    return drawn
+
+
+def _ranges(whole: Selected, curves: Sequence[Curve]) -> list[Curve]:
+    """Return the ranges of the members of a column as bands around the curves of their means."""
+    low, high = whole.values.min(axis=1), whole.values.max(axis=1)
+    made = []
+    for curve in curves:
+        part = ("xyz".index(curve.key[-1]),) if whole.vector else ()
+        bounds = np.stack([low[:, *part], high[:, *part]], axis=1)
+        made.append(Curve("", bounds, {"color": curve.style["color"], "alpha": 0.15}, place=curve.place, kind="band"))
+    return made
+
+
+def _curves_of(
+    found: Sequence[Mapping[str, np.ndarray]], labels: Sequence[str], caption: str, split: bool
+) -> Iterator[tuple[int, Curve]]:
+    """Yield the number of a result and one of the curves that :func:`column` found in it, with its name and style.
+
+    Dashes are those of components, in charts ``split`` into them, else of a few results.
+    """
+    parts, several = _parts(found), len(found) > 1
+    for number, (columns, label) in enumerate(zip(found, labels, strict=True)):
+        for k, part in enumerate(parts):
+            if part in columns:
+                names = [label] if several else []
+                names += [part.rpartition(".")[2] if caption else part] if len(parts) > 1 else []
+                key = f"{part}: {label}" if several else part
+                dash = k if split else number if len(found) <= len(DASHES) else None
+                style = distinct(number, dash) if several else distinct(k, 0)
+                yield number, Curve(" ".join(names) or caption or "computed", columns[part], style, key)
+
+
 def _filtered(result: Any, chosen: Filter | None, name: str, values: np.ndarray) -> np.ndarray:
     """Return the values (rows,) of a column or expression after a filter, those of energies as they are."""
-    history = result.history
-    if chosen is None or _is_energy(select(history, name)):
+    history, found = result.history, select(result.history, name)
+    if chosen is None or _is_energy(found):
         return values
-    sources = select(history, name).sources
     # forces of contact are zero before the run, and so is what is computed from them, unless something is added
-    touch = all(one.startswith(("wall/", "pair/", "constraint/")) and one.endswith("/force") for one in sources)
-    before = {one: np.zeros_like(history[one][:1]) for one in sources if touch}
+    touch = all(one.startswith(("wall/", "pair/", "constraint/")) and one.endswith("/force") for one in found.sources)
+    before = {one: np.zeros_like(history[one][:1]) for one in found.sources if touch}
     return smoothed(result, chosen, values, touch and not np.any(select(before, name).values))
 
 
@@ -561,16 +559,6 @@ def _parts(found: Sequence[Mapping[str, np.ndarray]]) -> list[str]:
     there."""
     parts = list(dict.fromkeys(part for curves in found for part in curves))
     return [part for part in parts if any(np.any(curves.get(part, 0.0)) for curves in found)] or parts
-
-
-def _line(number: int, part: int, results: int, split: bool) -> dict[str, Any]:
-    """Return the style of a curve: a result has its colour in all panels.
-
-    Dashes are those of components, in charts ``split`` into them, else of a few results.
-    """
-    if results == 1:
-        return distinct(part, 0)
-    return distinct(number, part if split else number if results <= len(DASHES) else None)
 
 
 def _labels_and_captions(
@@ -674,31 +662,24 @@ def draw_spectra(
     split = any(len(_parts(found)) > 1 for found in columns)
     panels = []
     for name, caption, found in zip(names, captions, columns, strict=True):
-        whole, parts = select(first.history, name), _parts(found)
-        unit = whole.unit or ""
-        curves = []
-        for number, (label, result) in enumerate(zip(labels, results, strict=True)):
-            time = read(result.history, "time")
-            rows = max(result.stretches, key=lambda rows, time=time: float(np.ptp(time[rows])))
-            for part in (part for part in parts if part in found[number]):
-                key = f"{part}: {label}" if len(results) > 1 else part
-                frequency, amplitude = amplitude_spectrum(time[rows], found[number][part][rows], window)
-                style = _line(number, parts.index(part), len(results), split)
-                curves.append(Curve(key, amplitude, style, place=frequency))
+        whole, curves = select(first.history, name), []
+        for number, curve in _curves_of(found, labels, caption, split):
+            time = read(results[number].history, "time")
+            rows = max(results[number].stretches, key=lambda rows, time=time: float(np.ptp(time[rows])))
+            frequency, amplitude = amplitude_spectrum(time[rows], curve.values[rows], window)
+            kept = frequency <= (highest or np.inf)
+            curves.append(curve._replace(values=amplitude[kept], place=frequency[kept]))
         label = f"amplitude of\n{caption or quantity_of(name, whole)}"
-        legend, title = len(curves) > 1, f"window: {window}" if caption else f"{name}, window: {window}"
-        along = prefix_for(highest or max(curve.place[-1] for curve in curves), "Hz")
-        over, scale = ("frequency", "Hz"), (1.0, unit)
-        panels.append(Panel(label, unit, curves, title, 1.1, over, scale, legend, True, along))
-    title = first.case.title or first.case.name
-    chart = Chart(panels, title, np.zeros(1))
+        title, scale = f"window: {window}" if caption else f"{name}, window: {window}", (1.0, whole.unit or "")
+        several = len(curves) > 1
+        panels.append(Panel(label, scale[1], curves, title, 1.1, ("frequency", "Hz"), scale, several, log=True))
+    chart = Chart(panels, first.case.title or first.case.name, np.zeros(1))
+    factor, shown = chart.scales["Hz"]
     for axes, panel in zip(chart.axes, panels, strict=True):
-        factor, shown = panel.along
         end = highest or max(curve.place[-1] for curve in panel.curves)
-        inside = [(curve.place > 0.0) & (curve.place <= end) for curve in panel.curves]
-        top = max(largest(curve.values[part]) for curve, part in zip(panel.curves, inside, strict=True))
+        top = max(largest(curve.values[curve.place > 0.0]) for curve in panel.curves)
         if len(panel.curves) == 1:
-            _tell_peaks(axes, panel.curves[0].place[inside[0]], panel.curves[0].values[inside[0]], factor, shown)
+            _tell_peaks(axes, panel.curves[0].place[1:], panel.curves[0].values[1:], factor, shown)
         if top > 0.0:
             axes.set_ylim(1e-6 * top, 4.0 * top)
         axes.set_xlim(0.0, end * factor)

@@ -20,10 +20,10 @@ from ..output.result import stage_at
 from ..parallel.agreement import agreed
 from ..signals import launched_rank
 from .chart import opened
-from .motion import PERIOD, ModeFrames, Motion, Resampled, chosen_frames, drawn_radii, even_rows, even_times
+from .motion import PERIOD, Motion, chosen_frames, drawn_radii, even_rows, even_times, mode_frames, resampled
 from .options import Options
 from .page import MARKS, ColourField, ColourScale, Heading, Page, grid
-from .scene import FEW, TUBE_LIMIT, WALL_COLOUR, Scene, Segments, Style, at_one_scale, cameras, few_threads
+from .scene import FEW, TUBE_LIMIT, WALL_COLOUR, Scene, Style, at_one_scale, cameras, few_threads, tubes
 
 if TYPE_CHECKING:
     from mpi4py import MPI
@@ -52,9 +52,9 @@ _ENCODERS = {
 
 def _style(options: Options, result: Any, note: Callable[[str], None]) -> Style:
     """Return how the bars of a result are drawn."""
-    tubes = len(result.bars) <= TUBE_LIMIT if options.style == "auto" else options.style == "tubes"
+    tubes = options.style == "tubes" or (options.style == "auto" and len(result.bars) <= TUBE_LIMIT)
     radius = drawn_radii(result, note if options.style == "tubes" else None) if tubes else None
-    return Style(tubes, None if radius is None else options.radius_scale * radius, options.bar_width, options.nodes)
+    return Style(None if radius is None else options.radius_scale * radius, options.bar_width, options.nodes)
 
 
 def render(
@@ -88,9 +88,8 @@ def render(
     from mpi4py import MPI
 
     comm = comm or MPI.COMM_SELF
-    first = comm.rank == 0
+    first, chosen = comm.rank == 0, Options(**options)
     tell = note if first else _nothing
-    chosen = Options(**options)
     paths = list(result_path) if isinstance(result_path, (list, tuple)) else [result_path]
     with ExitStack() as stack:
         results = [stack.enter_context(opened(each)) for each in paths]
@@ -157,7 +156,7 @@ def render_modes(
         As ``render``, and where the result has no such modes.
     """
     with opened(result_path) as result:
-        frames = ModeFrames(result, modes, period)
+        frames = mode_frames(result, modes, period)
         folder = Path(output) if output is not None else Path(result.path).parent / "modes"
         count = len(frames.times)
         return render(frames, folder, field="amplitude", frames=count, **{"clim": (0.0, 1.0)} | options)
@@ -195,8 +194,7 @@ class Film:
         self.motions = [Motion(result, chosen, options, note) for result in shown]
         self.styles = [_style(options, result, note) for result in results]
         for motion, style in zip(self.motions, self.styles, strict=True):
-            if style.radius is not None and len(style.radius):
-                motion.reach = max(motion.reach, float(style.radius.max()))
+            motion.reach = max(motion.reach, 0.0 if style.radius is None else float(style.radius.max(initial=0.0)))
         case = results[0].case
         self.title = options.title if options.title is not None else (case.title or case.name)
         self._scenes: list[Scene] = []
@@ -229,9 +227,9 @@ class Film:
         several, columns = len(self.motions) > 1, 1
         if several:
             columns, _ = grid(len(self.motions), self._aspect(), Page.region_of(size)[2:])
-        inset = self._aspect() if self.options.inset is not None else 0.0
+        inset = self.options.inset is not None
         self._prepare(size, self._labels if several else [""], columns, inset)
-        if self.options.inset is not None:
+        if inset:
             self._page.add_insets([motion.result for motion in self.motions], self.options.inset)
 
     def frame(self, number: int) -> np.ndarray:
@@ -262,7 +260,7 @@ class Film:
             scene.close()
         self._scenes = []
 
-    def _prepare(self, size: tuple[int, int], captions: Sequence[str], columns: int, inset: float = 0.0) -> None:
+    def _prepare(self, size: tuple[int, int], captions: Sequence[str], columns: int, inset: bool = False) -> None:
         """Make page, cameras and scenes for a size in pixels and drawings with captions in columns."""
         self.close()
         options = self.options
@@ -286,8 +284,7 @@ class Film:
         motion, colour, scene, camera = self.motions[k], self.colours[k], self._scenes[k], self._cameras[k][number]
         frame = motion.frames[number]
         shades, layers = self.scale.colours(colour.values(frame)), motion.layers(frame, scene, camera)
-        surfaces, gone = motion.surfaces[frame], motion.gone(frame)
-        return scene.draw(motion.positions(frame), shades, camera, surfaces, gone, layers)
+        return scene.draw(motion.positions(frame), shades, camera, motion.surfaces[frame], motion.whole(frame), layers)
 
     def _acting(self, numbers: Sequence[int]) -> tuple[list[dict[str, np.ndarray]], list[str]]:
         """Return the directions of gravity and wind in each drawing of frames, and what is told of its loads."""
@@ -333,9 +330,9 @@ def _timed(results: Sequence[Any], options: Options, note: Callable[[str], None]
         if options.frames is not None:
             raise InputError("render: frames and rate both choose the frames; give one of the two")
         times = even_times(times, options.rate, options.span)
-        return [Resampled(result, times) for result in results], list(range(len(times)))
+        return [resampled(result, times) for result in results], list(range(len(times)))
     chosen = chosen_frames(options.frames, times, note, options.span)
-    return [results[0], *(Resampled(result, times) for result in results[1:])], chosen
+    return [results[0], *(resampled(result, times) for result in results[1:])], chosen
 
 
 def instants(result: Any, frames: Sequence[int], count: int) -> list[int]:
@@ -481,18 +478,12 @@ def _figure(film: Film) -> Any:
 
     motion, colour, scale = film.motions[0], film.colours[0], film.scale
     frame, camera = motion.frames[0], cameras(film.options, motion, 1.6)[0]
-    start, now, gone = motion.start, motion.positions(frame), motion.gone(frame)
-    style = film.styles[0]
-    kind = "line" if not style.tubes else "rough" if motion.n_bars <= FEW else "prism"
+    style, left, values = film.styles[0], motion.whole(frame), colour.values(frame)
+    bars, shown = motion.bars[left], scale.factor * (values[motion.bars] if colour.on_nodes else values[:, None])
+    shown = np.broadcast_to(shown, motion.bars.shape)[left]
     least = next((width for most, width in _WIDTHS if motion.n_bars <= most), 1.2)
-    radius = np.zeros(motion.n_bars) if style.radius is None else style.radius
-    radius = np.maximum(radius, least * camera.half_height / 720)
-    bars = Segments(None, motion.bars, kind, colour.on_nodes)
-    steps = np.linspace(0.0, 1.0, _SHAPES if motion.n_bars <= TUBE_LIMIT else 2)
-    places = []
-    for step in steps:
-        bars.move(start + step * (now - start), radius if gone is None else np.where(gone, -1.0, radius))
-        places.append(np.asarray(bars.mesh.points).T.copy())
+    shares = np.linspace(0.0, 1.0, _SHAPES if motion.n_bars <= TUBE_LIMIT else 2)
+    shapes = [(motion.start + share * (motion.positions(frame) - motion.start))[bars] for share in shares]
     label = colour.title + (f" [{scale.unit}]" if scale.unit else "")
     low, high = scale.shown.get_clim()
     shades: dict[str, Any] = {
@@ -501,22 +492,24 @@ def _figure(film: Film) -> Any:
         "cmax": high,
         "colorbar": {"title": {"text": label.replace(" ", "<br>", 1)}, "len": 0.7, "thickness": 20},
     }
-    values = scale.factor * colour.values(frame)[bars.rows].astype(np.float32)
     look: dict[str, Any] = {"hoverinfo": "skip"}
-    if style.tubes:
-        corners, trace = bars.mesh.regular_faces, plotly.Mesh3d
-        look |= dict(zip("ijk", np.concatenate([corners[:, [0, 1, 2]], corners[:, [0, 2, 3]]]).T, strict=True))
-        look |= {"intensity": values, "lighting": {"ambient": 0.8, "diffuse": 0.25, "specular": 0.0}, **shades}
+    if style.radius is not None:
+        both = np.repeat(np.maximum(style.radius[left], least * camera.half_height / 720)[:, None], 2, axis=1)
+        made = [tubes(lines, both, 6, False, value=shown)[0].triangulate() for lines in shapes]
+        places, trace = [np.asarray(mesh.points).T for mesh in made], plotly.Mesh3d
+        look |= dict(zip("ijk", made[0].regular_faces.T, strict=True)) | {"intensity": made[0]["value"], **shades}
+        look |= {"lighting": {"ambient": 0.8, "diffuse": 0.25, "specular": 0.0}}
     else:
         # a line ends where a number is missing
-        places = [np.insert(x.reshape(3, 2, -1).swapaxes(1, 2), 2, np.nan, axis=2).reshape(3, -1) for x in places]
-        between, trace = np.insert(values.reshape(2, -1).T, 2, 0.0, axis=1).ravel(), plotly.Scatter3d
+        places = [np.insert(lines, 2, np.nan, axis=1).reshape(-1, 3).T for lines in shapes]
+        between, trace = np.insert(shown, 2, 0.0, axis=1).ravel(), plotly.Scatter3d
         look |= {"mode": "lines", "line": {"color": between, "width": 2.0 * least, **shades}}
     traces = [dict(zip("xyz", x, strict=True)) for x in places]
     walls = [_wall(plotly, surface) for surface in motion.surfaces[frame]]
     figure = plotly.Figure([trace(**traces[-1], **look), *walls])
     figure.frames = [
-        plotly.Frame(name=f"{step:.2f}", data=[trace(**x)], traces=[0]) for step, x in zip(steps, traces, strict=True)
+        plotly.Frame(name=f"{share:.2f}", data=[trace(**shape)], traces=[0])
+        for share, shape in zip(shares, traces, strict=True)
     ]
     now = {"mode": "immediate", "frame": {"duration": 0, "redraw": True}, "transition": {"duration": 0}}
     choices = [{"label": each.name, "method": "animate", "args": [[each.name], now]} for each in figure.frames]
@@ -526,7 +519,7 @@ def _figure(film: Film) -> Any:
         margin={"l": 0, "r": 0, "t": 60, "b": 20},
         showlegend=False,
         sliders=[
-            {"active": len(steps) - 1, "steps": choices, "len": 0.5, "x": 0.03, "currentvalue": {"prefix": "shape: "}}
+            {"active": len(shares) - 1, "steps": choices, "len": 0.5, "x": 0.03, "currentvalue": {"prefix": "shape: "}}
         ],
         scene={
             "aspectmode": "data",
@@ -544,10 +537,10 @@ def _figure(film: Film) -> Any:
 
 def _wall(plotly: Any, surface: Any) -> Any:
     """Return the face of a wall that nodes touch."""
-    faces = np.asarray(surface.faces)
-    faces = faces[(np.asarray(surface.depth)[faces] == 0.0).all(axis=1)]
-    parts = np.concatenate([faces[:, [0, k, k + 1]] for k in range(1, faces.shape[1] - 1)])
-    corners = dict(zip("ijk", parts.T, strict=True))
-    x, y, z = np.asarray(surface.points, dtype=float).T
+    import pyvista
+
+    touched = (np.asarray(surface.depth)[surface.faces] == 0.0).all(axis=1)
+    face = pyvista.PolyData.from_regular_faces(surface.points, surface.faces[touched]).triangulate()
+    places = dict(zip("xyzijk", (*face.points.T, *face.regular_faces.T), strict=True))
     shade = "rgb({},{},{})".format(*WALL_COLOUR)
-    return plotly.Mesh3d(x=x, y=y, z=z, **corners, color=shade, opacity=0.35, hoverinfo="skip")
+    return plotly.Mesh3d(**places, color=shade, opacity=0.35, hoverinfo="skip")

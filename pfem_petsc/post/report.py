@@ -93,11 +93,11 @@ def _truss(result: Any, file: Path, field: str) -> str:
 
     try:
         film = Film([result], Options(field=field, size=SIZE), lambda text: None)
-        picture = save(film.poster(), file)
+        save(film.poster(), file)
     except InputError as error:
         return _NO_PICTURES.format(html.escape(str(error)))
     film.close()
-    return _figure(picture, "Instants, or ends of load cases, coloured by the field named beside the scale")
+    return _figure(file, "Instants, or ends of load cases, coloured by the field named beside the scale")
 
 
 def _document(result: Any, curves: Sequence[Path], truss: str) -> str:
@@ -227,29 +227,21 @@ def _events(result: Any) -> str:
 
 def _log(result: Any) -> dict[str, list[str]]:
     """Return warnings, closing lines and memory from the log beside the result."""
-    found: dict[str, list[str]] = {"warnings": [], "done": [], "memory": []}
-    try:
-        text = (Path(result.path).parent / "log.txt").read_text(encoding="utf-8", errors="replace")
-    except OSError:
-        return found
+    file = Path(result.path).parent / "log.txt"
+    text = file.read_text(encoding="utf-8", errors="replace") if file.is_file() else ""
     entries = re.findall(r"^\S+ \S+ (\w+) +(.*(?:\n(?!\d{4}-\d\d-\d\d ).*)*)", text, flags=re.MULTILINE)
-    for level, message in entries:
-        message = message.strip()
-        if level in ("WARNING", "ERROR") and message not in found["warnings"]:
-            found["warnings"].append(message)
-        elif message.startswith(("done:", "stopped")):
-            found["done"].append(message.removeprefix("done: "))
-        elif message.startswith("memory"):
-            found["memory"] = [message.removeprefix("memory").strip()]
-    return found
+    told = [message.strip() for level, message in entries if level not in ("WARNING", "ERROR")]
+    return {
+        "warnings": list(dict.fromkeys(text.strip() for level, text in entries if level in ("WARNING", "ERROR"))),
+        "done": [text.removeprefix("done: ") for text in told if text.startswith(("done:", "stopped"))],
+        "memory": [text.removeprefix("memory").strip() for text in told if text.startswith("memory")],
+    }
 
 
 def _cost(result: Any, log: Mapping[str, list[str]]) -> dict[str, str]:
-    rows = {"run" if k == 0 else f"continued ({k})": text for k, text in enumerate(log["done"])}
-    if not rows:
-        rows["run"] = "not finished, or its log is not beside the result"
-    if log["memory"]:
-        rows["memory"] = log["memory"][-1]
+    done = log["done"] or ["not finished, or its log is not beside the result"]
+    rows = {"run" if k == 0 else f"continued ({k})": text for k, text in enumerate(done)}
+    rows |= {"memory": log["memory"][-1]} if log["memory"] else {}
     rows["ranks"] = str(result.attributes.get("ranks", "?"))
     rows["result file"] = f"{Path(result.path).stat().st_size / 1e6:.3g} MB"
     totals = {name: int(np.sum(result.history.get(name, 0))) for name in ("newton_iterations", "linear_iterations")}

@@ -3,17 +3,21 @@
 from __future__ import annotations
 
 import functools
+import math
 import os
 import subprocess
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 from ..contact.walls.base import Surface
 from ..errors import InputError
+
+if TYPE_CHECKING:
+    import pyvista
 
 VIEWS = ("auto", "xy", "xz", "yz", "iso", "front", "back", "left", "right", "top", "bottom")
 
@@ -109,13 +113,11 @@ def direction(
 def _oblique(normals: Sequence[np.ndarray], upward: np.ndarray) -> np.ndarray:
     """Return the direction of the eye: slightly from above, from the quadrant that sees most walls from the front."""
     first = np.array(_X if abs(upward[0]) < 0.9 else _Y)
-    second = np.cross(upward, first)
-    # -second points towards the viewer in a right-handed picture, the default quadrant
-    quarters = [a * first + b * second for b in (-1.3, 1.3) for a in (0.9, -0.9)]
-    quarters += [1.3 * a * first + 0.9 * b * second for b in (-1.0, 1.0) for a in (1.0, -1.0)]
-    directions = [(each + 0.65 * upward) / np.linalg.norm(each + 0.65 * upward) for each in quarters]
-    seen = [sum(min(0.3, float(normal @ each)) for normal in normals) for each in directions]
-    return directions[int(np.argmax(np.round(seen, 6)))]
+    second = np.cross(upward, first)  # which points away from the viewer of a right-handed picture
+    faced = np.sum([np.zeros(3), *normals], axis=0)
+    way = (0.9 if faced @ first > -1e-6 else -0.9) * first + (1.3 if faced @ second > 1e-6 else -1.3) * second
+    way += 0.65 * upward
+    return way / np.linalg.norm(way)
 
 
 def fit(
@@ -170,12 +172,10 @@ def cameras(options: Any, motion: Any, aspect: float) -> list[Camera]:
     points, reach, count = motion.surroundings, motion.reach, len(motion.frames)
     if not options.orbit and options.follow is None:
         return [fit(points, way, aspect, reach=reach).zoomed(options.zoom)] * count
-    ways = [way] * count
-    if options.orbit:
-        from scipy.spatial.transform import Rotation
+    from scipy.spatial.transform import Rotation
 
-        turns = np.linspace(0.0, np.radians(options.orbit), count)[:, None] * up / np.linalg.norm(up)
-        ways = [(each, up, parallel) for each in Rotation.from_rotvec(turns).apply(towards)]
+    turns = np.linspace(0.0, np.radians(options.orbit), count)[:, None] * up / np.linalg.norm(up)
+    ways = [(each, up, parallel) for each in Rotation.from_rotvec(turns).apply(towards)]
     if options.follow is None:
         centre = motion.bounds.mean(axis=0)
         made = [fit(points, way, aspect, centre=centre, reach=reach) for way in ways]
@@ -202,13 +202,9 @@ FEW = 2000
 WALL_COLOUR, EDGE_COLOUR, NODE_COLOUR = (116, 125, 138), (75, 85, 99), (31, 36, 44)
 VARIABLE = "VTK_DEFAULT_OPENGL_WINDOW"
 
-_ANYWHERE = np.array([0.36, 0.48, 0.8])
+_CORE, _EDGE = 0.84, 0.35  # what a bar has in its colour, and the shade of the rim around it, which crossing bars have
 _STOUT = 16.0  # pixels: width from which bars show their ends themselves, without dots at nodes
-_ROUND = 2.5  # pixels: radius from which a bar has a round surface; thinner ones are flat
-# Crossing bars are told apart by their rims, where the surface faces the eye with a cosine below the first number: the
-# outer 12 % of the radius. Between, colours are those of the field. The share of black at the edge grows with the width
-# of bars [pixels], so that thin ones keep their colour.
-_RIM, _BLACK, _WIDTHS = 0.48, (0.45, 0.75), (2.0, 6.0)
+_THIN = 4.5  # pixels: width up to which bars have no rim
 _MOST_PIXELS = (1.5e6, 1e7)  # up to which 3 x 3 (small models) and 2 x 2 pixels are averaged to one
 
 # Nothing is shown, so a display is not tried first: it may be closed, or remote over ssh.
@@ -274,128 +270,56 @@ def few_threads() -> None:
     os.environ.setdefault("LP_NUM_THREADS", "0")  # in the thread that draws
 
 
-def _form(kind: str) -> tuple[np.ndarray, np.ndarray]:
-    """Return the points (m, 4) of a bar and its cells (c, 2 or 4).
-
-    A point is (end, along, across, facing): ``x[end] + radius (along a + across u + facing v)`` with the direction a of
-    the bar, u across it and the view, and v towards the eye. A ``line`` is two points, a ``strip`` faces the eye, a
-    ``ribbon`` does so between two rims, a ``prism`` has open ends, and ``round`` bars and ``rough`` ones, of fewer
-    sides, are cylinders with half a sphere at each end. Nothing is lit: colours do not depend on where a bar is.
-    """
-    if kind == "line":
-        return np.array([[0.0, 0, 0, 0], [1, 0, 0, 0]]), np.array([[0, 1]])
-    if kind == "ribbon":
-        wide, high = np.array([-1.0, -0.8, 0.8, 1.0]), np.array([0.0, 0.6, 0.6, 0.0])
-        points = [[end, 0.0, a, b] for end in (0.0, 1.0) for a, b in zip(wide, high, strict=True)]
-        return np.array(points), np.array([[k, k + 1, k + 5, k + 4] for k in range(3)])
-    if kind == "strip":
-        return np.array([[0.0, 0, -1, 0], [0, 0, 1, 0], [1, 0, 1, 0], [1, 0, -1, 0]]), np.array([[0, 1, 2, 3]])
-    sides, rings = {"round": (20, 5), "rough": (8, 2), "prism": (6, 1)}[kind]
-    angle, height = 2.0 * np.pi * np.arange(sides) / sides, np.linspace(-np.pi / 2, 0.0, rings)
-    height[-1] = 0.0
-    levels = [(0.0, level) for level in height] + [(1.0, -level) for level in height[::-1]]
-    points = [
-        [end, np.sin(level), np.cos(level) * np.cos(turn), np.cos(level) * np.sin(turn)]
-        for end, level in levels
-        for turn in angle
-    ]
-    here = np.arange(sides * (len(levels) - 1)).reshape(-1, sides)
-    beside = np.roll(here, -1, axis=1)
-    return np.array(points), np.stack([here, here + sides, beside + sides, beside], axis=-1).reshape(-1, 4)
-
-
-class Segments:
-    """Bars as one PolyData in a plotter of pyvista, whose points and colours change in place.
-
-    Its points are in the order of the points of a form, and of the bars for each of these.
+def tubes(
+    lines: np.ndarray, radius: np.ndarray, sides: int, rounded: bool, **values: np.ndarray
+) -> list[pyvista.PolyData]:
+    """Return tubes around lines, and balls at the ends of the widest ones at each place, with values of these ends.
 
     Parameters
     ----------
-    plotter : of pyvista; None: the mesh is in none
-    ends : (b, 2) int, nodes
-    kind : see :func:`_form`
-    on_nodes : whether colours are those of nodes, and not of bars
-    width : of lines, in pixels of the window
-
-    Attributes
-    ----------
-    mesh : the PolyData
-    ends : (2, b) int, the nodes at both ends
-    rows : (p,) int, the node or the bar whose colour each point of the mesh has
+    lines : (m, 2, 3) [m]
+    radius : (m, 2) [m]
+    sides : of a tube
+    rounded : whether there are balls
+    values : (m, 2, ...) by name, data of the points of the meshes
     """
+    import pyvista
 
-    def __init__(self, plotter: Any, ends: np.ndarray, kind: str, on_nodes: bool, width: float = 1.0) -> None:
-        import pyvista
-
-        form, cells = _form(kind)
-        self.ends = np.ascontiguousarray(np.transpose(ends), dtype=np.int64)
-        self._end, self._form, count = form[:, 0].astype(int), form[:, 1:].astype(np.float32), len(ends)
-        self._colour_rows = self.ends if on_nodes else np.stack([np.arange(count)] * 2)
-        self.rows = self._colour_rows[self._end].ravel()
-        kept = pyvista.CellArray.from_regular_cells(
-            (count * cells + np.arange(count)[:, None, None]).reshape(-1, cells.shape[1])
-        )
-        places = np.zeros((count * len(form), 3), dtype=np.float32)
-        self.mesh = pyvista.PolyData(places, lines=kept) if kind == "line" else pyvista.PolyData(places, faces=kept)
-        self.mesh.point_data["colour"] = np.zeros(places.shape, dtype=np.uint8)
-        if plotter is not None:
-            options: dict[str, Any] = {"scalars": "colour", "rgb": True, "preference": "point", "line_width": width}
-            self.actor = plotter.add_mesh(self.mesh, lighting=False, reset_camera=False, render=False, **options)
-
-    def move(
-        self,
-        points: np.ndarray,
-        radius: np.ndarray,
-        colours: np.ndarray | None = None,
-        ahead: np.ndarray = _ANYWHERE,
-        black: np.ndarray | float = 0.0,
-    ) -> None:
-        """Draw bars between points.
-
-        Parameters
-        ----------
-        points : (n, 3) [m]
-        radius : (b,), or (2, b) at both ends [m]; negative: the bar is not drawn
-        colours : (n or b, 3) uint8
-        ahead : (3,), or (n, 3) at each node: the direction to the eye
-        black : (b,), the share of black at the rim
-        """
-        # single precision, component by component: passes over a million bars
-        first, last = ends = np.stack([x.astype(np.float32)[self.ends] for x in points.T], axis=1)
-        shape = len(self._end), -1, 3
-        axis = _unit(last - first)
-        towards = np.broadcast_to(ahead, points.shape).astype(np.float32).T
-        eye = _unit(np.stack([x[self.ends[0]] for x in towards]))
-        side = np.cross(axis, eye, axis=0)
-        along = np.flatnonzero((side**2).sum(axis=0) < 1e-10)  # seen along its axis: any direction is across
-        side[:, along] = np.cross(axis[:, along], np.eye(3)[:, np.abs(axis[:, along]).argmin(axis=0)], axis=0)
-        side = _unit(side)
-        facing = np.cross(side, axis, axis=0)
-        wide = np.broadcast_to(radius, self.ends.shape).astype(np.float32)
-        if (hidden := wide[0] < 0.0).any():
-            wide[:, hidden], last[:, hidden] = 0.0, first[:, hidden]
-        places, ways = self.mesh.points.reshape(shape), np.stack([axis, side, facing], axis=1)
-        for k in range(3):
-            places[..., k] = ends[self._end, k] + wide[self._end] * (self._form @ ways[k])
-        if colours is None:
-            return
-        left: Any = 1.0
-        if np.any(black):  # at the edge, the surface is seen along itself
-            facing = np.maximum(self._form @ np.einsum("kjb,kb->jb", ways, eye), self._form[:, 2:])
-            left = 1.0 - np.asarray(black, dtype=np.float32) * np.clip(1.0 - facing / _RIM, 0.0, 1.0)
-        shades = self.mesh.point_data["colour"].reshape(shape)
-        for k in range(3):
-            ink = colours[:, k].astype(np.float32)[self._colour_rows]
-            shades[..., k] = (ink[self._end] * left + 0.5).astype(np.uint8)
-
-
-def _unit(vectors: np.ndarray) -> np.ndarray:
-    """Return vectors (3, b) over their lengths, and the x axis for those that have none."""
-    length = np.sqrt((vectors**2).sum(axis=0))
-    none = length == 0.0
-    made = vectors / np.where(none, 1.0, length)
-    made[0, none] = 1.0
+    places = lines.reshape(-1, 3).astype(np.float32)
+    data = {name: np.ascontiguousarray(each).reshape(2 * len(lines), -1) for name, each in values.items()}
+    data["radius"] = radius.ravel() / math.sqrt(math.cos(math.pi / sides))  # as wide as round ones in the mean
+    cells = pyvista.CellArray.from_regular_cells(np.arange(len(places)).reshape(-1, 2))
+    mesh = pyvista.PolyData(places, lines=cells)
+    mesh.point_data.update(data)
+    made = [mesh.tube(scalars="radius", absolute=True, n_sides=sides, capping=False)]
+    if rounded:
+        widest = np.argsort(-data["radius"], kind="stable")
+        ends = widest[np.unique(places[widest], axis=0, return_index=True)[1]]
+        balls = pyvista.PolyData(places[ends])
+        balls.point_data.update({name: each[ends] for name, each in data.items()})
+        ball = pyvista.Sphere(radius=1.0, theta_resolution=sides, phi_resolution=sides)
+        made.append(balls.glyph(geom=ball, scale="radius", orient=False))
     return made
+
+
+def strips(lines: np.ndarray, radius: np.ndarray, ahead: np.ndarray, colour: np.ndarray) -> pyvista.PolyData:
+    """Return flat bars that face the eye, of many a fifth of the time of tubes.
+
+    Parameters
+    ----------
+    lines, radius : as of :func:`tubes`
+    ahead : (3,) or (m, 3), the direction to the eye
+    colour : (m, 2, 3) uint8 of both ends
+    """
+    import pyvista
+
+    side = np.cross(lines[:, 1] - lines[:, 0], ahead)
+    side /= np.maximum(np.linalg.norm(side, axis=1, keepdims=True), 1e-300)
+    places = lines[:, :, None] + radius[:, :, None, None] * np.stack([side, -side], axis=1)[:, None]
+    faces = 4 * np.arange(len(lines))[:, None] + [0, 1, 3, 2]
+    mesh = pyvista.PolyData.from_regular_faces(places.reshape(-1, 3).astype(np.float32), faces)
+    mesh.point_data["colour"] = np.repeat(colour.reshape(-1, 3), 2, axis=0)
+    return mesh
 
 
 @dataclass(frozen=True)
@@ -404,14 +328,12 @@ class Style:
 
     Parameters
     ----------
-    tubes : whether bars have the radii of their sections
-    radius : (b,) [m] of the bars; None: not known
-    bar_width : of bars without radii, and the least width of tubes, in pixels; None: by the size of the model
+    radius : (b,) [m] of tubes; None: bars are lines
+    bar_width : of lines, and the least width of tubes, in pixels; None: by the size of the model
     nodes : whether to draw nodes as balls; None: for small models
     rims : whether bars that are wide enough have dark rims
     """
 
-    tubes: bool
     radius: np.ndarray | None = field(default=None, repr=False)
     bar_width: float | None = None
     nodes: bool | None = None
@@ -419,24 +341,26 @@ class Style:
 
 
 class Layer(NamedTuple):
-    """Lines in addition to the bars.
+    """Lines or tubes.
 
     Attributes
     ----------
     points : (n, 3) [m]
     lines : (m, 2) int
-    colour : red, green, blue
-    width : in pixels of a picture of 1280 by 720
+    colour : red, green, blue; of lines (m, 1, 3), or of both ends (m, 2, 3)
+    width : in pixels of a picture of 1280 by 720; of tubes the least
     shift : how much nearer to the eye than their points they are, in such pixels
-    radius : (m,) [m], if they are as wide as bars and the width more
+    radius : (m,) [m] of tubes; None: lines
+    wider : by how much tubes are wider on each side, in such pixels, with only the sides away from the eye; None: whole
     """
 
     points: np.ndarray
     lines: np.ndarray
-    colour: tuple[int, int, int]
+    colour: np.ndarray | tuple[int, int, int]
     width: float
     shift: float = 0.0
-    radius: np.ndarray | float = 0.0
+    radius: np.ndarray | None = None
+    wider: float | None = None
 
 
 class Scene:
@@ -474,41 +398,20 @@ class Scene:
         lengths = pixels * np.linalg.norm(np.diff(motion.start[self._bars], axis=1)[:, 0], axis=1)
         shortest = float(np.quantile(lengths, 0.1)) if count else 1.0
         self.width = style.bar_width or _width(count, lengths, shortest, unit)
-        self._radius = np.zeros(count) if not style.tubes or style.radius is None else np.asarray(style.radius, float)
-        # at each node one of the widest bars has its end, and the others taper into it: equal ends would be speckled
-        order, ends = np.argsort(-np.tile(self._radius, 2), kind="stable"), self._bars.T.ravel()
-        self._apart = np.full(2 * count, 0.98)
-        self._apart[order[np.unique(ends[order], return_index=True)[1]]] = 1.0
+        self._radius = style.radius
         self._corners = np.array(np.meshgrid(*motion.bounds.T)).reshape(3, -1).T
-        window = [side * self._factor for side in size]
-        self._plotter = pyvista.Plotter(off_screen=True, window_size=window, lighting="none")
+        self._plotter = pyvista.Plotter(
+            off_screen=True, window_size=[side * self._factor for side in size], lighting="none"
+        )
         self._plotter.disable_anti_aliasing()
         self._plotter.renderer.SetUseOIT(False)  # walls are drawn in their order
         self._plotter.background_color = "black" if transparent else "white"
         self._plotter.screenshot(return_img=True)  # the first one draws by itself, and chooses a camera
-        self._transparent = transparent
-        thick = max(self.width, 2.0 * pixels * float(np.quantile(self._radius, 0.9)) if count else 0.0)
-        solid = style.rims and (count <= FEW or (thick >= 2.0 * _ROUND * unit and count <= TUBE_LIMIT))
-        if solid:
-            kind = "round" if thick >= 2.0 * _ROUND * unit and count <= FEW else "rough"
-        else:
-            many = "strip" if style.tubes else "line"
-            kind = many if count > TUBE_LIMIT else "ribbon" if style.rims else "strip"
-        self._rims = kind not in ("line", "strip")
-        self.segments = Segments(self._plotter, self._bars, kind, on_nodes, self.width * self._factor)
+        self._transparent, self._on_nodes = transparent, on_nodes
+        thick = self.width if self._radius is None else max(self.width, 2.0 * pixels * np.quantile(self._radius, 0.9))
+        self._rims = style.rims and count <= TUBE_LIMIT and thick > _THIN * unit
         few = count <= 400 and shortest > 3.0 * self.width and thick < _STOUT * unit
-        nodes = few if style.nodes is None else style.nodes
-        self._nodes = self._balls() if nodes else None
-        self._extra: list[Any] = []
-        self._outline = max(1.2, 1.0 / unit)  # of marked bars: a pixel at least
-
-    def _balls(self) -> tuple[Segments, np.ndarray]:
-        """Return nodes as bars without length, and the radii of the widest bars there."""
-        used, radius = np.unique(self._bars), np.zeros(int(self._bars.max(initial=-1)) + 1)
-        np.maximum.at(radius, self._bars, self._radius[:, None])
-        balls = Segments(self._plotter, np.stack([used, used], axis=1), "round", False)
-        balls.mesh.point_data["colour"][:] = NODE_COLOUR
-        return balls, radius[used]
+        self._dots = few if style.nodes is None else style.nodes
 
     def close(self) -> None:
         """Give the window back."""
@@ -520,7 +423,7 @@ class Scene:
         colours: np.ndarray,
         camera: Camera,
         surfaces: Sequence[Surface] = (),
-        gone: np.ndarray | None = None,
+        whole: np.ndarray | None = None,
         layers: Sequence[Layer] = (),
     ) -> np.ndarray:
         """Draw a frame.
@@ -531,7 +434,7 @@ class Scene:
         colours : (n, 3) or (b, 3) uint8
         camera : of this frame
         surfaces : walls
-        gone : (b,) bool, bars that are left out
+        whole : (b,) bool, bars that are drawn; None: all
         layers : lines in addition to the bars
 
         Returns
@@ -540,26 +443,24 @@ class Scene:
         """
         from PIL import Image
 
-        self._plotter.remove_actor(self._extra, reset_camera=False, render=False)
-        pixel = camera.metres(points) / self.size[1]
-        radius = np.maximum(self._radius, 0.5 * self.width * pixel[self.segments.ends]) * self._apart.reshape(2, -1)
-        if gone is not None:
-            radius[:, gone] = -1.0
-        ahead = camera.ahead(points)
-        black = 0.0
-        if self._rims:
-            wide = 2.0 * radius[0] / np.maximum(pixel[self.segments.ends[0]], 1e-300) / self.unit
-            black = np.interp(wide, _WIDTHS, _BLACK)
-        self.segments.move(points, radius, colours, ahead, black)
-        if self._nodes is not None:  # dots on the bars, half as wide
-            balls, sizes = self._nodes
-            rows = balls.ends[0]
-            sizes = np.maximum(sizes, 0.5 * self.width * pixel[rows])
-            dots = points.copy()
-            dots[rows] += 2.2 * sizes[:, None] * np.transpose(_unit(np.broadcast_to(ahead, points.shape)[rows].T))
-            balls.move(dots, np.maximum(0.5 * sizes, 1.3 * self.unit * pixel[rows]))
-        self._extra = [self._add(layer, camera) for layer in layers if len(layer.lines)]
-        self._extra += self._add_walls(surfaces, camera)
+        self._plotter.clear_actors()
+        left = slice(None) if whole is None else whole
+        shades = colours[self._bars[left]] if self._on_nodes else colours[left, None]
+        width, radius = self.width / self.unit, None if self._radius is None else self._radius[left]
+        bars = Layer(points, self._bars[left], shades, width, radius=radius)
+        if self._rims:  # lines in a dark shade behind, or wider tubes seen from within
+            behind = -width if radius is None else 0.0
+            self._add(bars._replace(colour=_EDGE * shades, shift=behind, wider=0.0), camera)
+            bars = bars._replace(width=_CORE * width, radius=None if radius is None else _CORE * radius)
+        for layer in (bars, *layers):
+            self._add(layer, camera)
+        if self._dots:  # on the bars, half as wide
+            thick = self.thickness(camera)
+            dots = self._nearer(points[np.unique(self._bars)], 1.1 * thick, camera)
+            size = max(0.5 * thick, 2.6) * self.unit * self._factor
+            look = {"color": NODE_COLOUR, "point_size": size, "render_points_as_spheres": True}
+            self._plotter.add_mesh(dots.astype(np.float32), style="points", lighting=False, **look)
+        self._add_walls(surfaces, camera)
         eye = camera.centre + camera.distance * camera.towards
         self._plotter.camera_position = [eye, camera.centre, camera.up]
         view = self._plotter.camera
@@ -576,32 +477,52 @@ class Scene:
 
     def thickness(self, camera: Camera) -> float:
         """Return the width of the widest bar, in pixels of a page of 1280 by 720."""
-        pixels = self.size[1] / (2.0 * camera.half_height)
-        return max(self.width, 2.0 * pixels * float(self._radius.max(initial=0.0))) / self.unit
+        radius = 0.0 if self._radius is None else float(self._radius.max(initial=0.0))
+        return max(self.width, self.size[1] / camera.half_height * radius) / self.unit
 
     def rim(self, points: np.ndarray, bars: np.ndarray, colour: tuple[int, int, int]) -> Layer:
         """Return a layer that outlines bars (numbers) by a pixel or so."""
-        width = self.width / self.unit + 2.0 * self._outline
-        return Layer(points, self._bars[bars], colour, width, -1.0, self._radius[bars])
+        outline = max(1.2, 1.0 / self.unit)  # a pixel at least
+        width = self.width / self.unit
+        if self._radius is None:
+            return Layer(points, self._bars[bars], colour, width + 2.0 * outline, -width - 1.0)
+        behind = -1.0 if len(self._bars) > TUBE_LIMIT else 0.0  # flat bars hide nothing of themselves
+        return Layer(points, self._bars[bars], colour, width, behind, self._radius[bars], outline)
 
-    def _add(self, layer: Layer, camera: Camera) -> Any:
-        pixel = 2.0 * camera.half_height / self.size[1] * self.unit
-        points, ahead = np.asarray(layer.points, dtype=float), camera.ahead(np.asarray(layer.points, dtype=float))
-        far = np.linalg.norm(ahead, axis=-1, keepdims=True)  # along the ray, so that it is seen at the same place
-        points = points + np.minimum(layer.shift * pixel / far, np.inf if camera.parallel else 0.6) * ahead
-        made = Segments(self._plotter, layer.lines, "strip", False)
-        least = max(0.5 * layer.width * self.unit, 0.4) * camera.metres(points)[made.ends] / self.size[1]
-        radius = layer.radius + self._outline * pixel if np.any(layer.radius) else 0.0
-        made.mesh.point_data["colour"][:] = layer.colour
-        made.move(points, np.maximum(radius, least), ahead=camera.ahead(points))
-        return made.actor
+    def _nearer(self, points: np.ndarray, shift: float, camera: Camera) -> np.ndarray:
+        """Return points (n, 3) [m] nearer to the eye by pixels of a page, where they are seen at the same place."""
+        ahead = camera.ahead(points)
+        metres = shift * 2.0 * camera.half_height / self.size[1] * self.unit
+        far = np.linalg.norm(ahead, axis=-1, keepdims=True)
+        return points + np.minimum(metres / far, np.inf if camera.parallel else 0.6) * ahead
 
-    def _add_walls(self, surfaces: Sequence[Surface], camera: Camera) -> list[Any]:
+    def _add(self, layer: Layer, camera: Camera) -> None:
+        if not len(layer.lines):
+            return
+        import pyvista
+
+        lines = self._nearer(np.asarray(layer.points, dtype=float), layer.shift, camera)[layer.lines]
+        shades = np.broadcast_to(np.asarray(layer.colour), lines.shape).astype(np.uint8)
+        look: dict[str, Any] = {"rgb": True, "lighting": False, "reset_camera": False, "render": False}
+        if layer.radius is None:
+            cells = np.insert(np.arange(2 * len(lines)).reshape(-1, 2), 0, 2, axis=1)
+            mesh = pyvista.PolyData(lines.reshape(-1, 3).astype(np.float32), lines=cells.ravel())
+            width = max(layer.width * self.unit, 1.0) * self._factor
+            self._plotter.add_mesh(mesh, scalars=shades.reshape(-1, 3), line_width=width, **look)
+            return
+        pixel = self.unit * camera.metres(lines.reshape(-1, 3)).reshape(-1, 2) / self.size[1]
+        radius = np.maximum(layer.radius[:, None], 0.5 * layer.width * pixel) + (layer.wider or 0.0) * pixel
+        if len(self._bars) > TUBE_LIMIT:
+            self._plotter.add_mesh(strips(lines, radius, camera.ahead(lines[:, 0]), shades), scalars="colour", **look)
+            return
+        for mesh in tubes(lines, radius, 20 if len(self._bars) <= FEW else 8, True, colour=shades):
+            self._plotter.add_mesh(mesh, scalars="colour", culling=layer.wider is not None and "front", **look)
+
+    def _add_walls(self, surfaces: Sequence[Surface], camera: Camera) -> None:
         """Draw walls, which one sees through and which fade out behind, and their edges, from the farthest to the
         nearest."""
         import pyvista
 
-        actors = []
         # without perspective, walls are behind all bars, so that they hide none
         depth = 4.0 * np.linalg.norm(np.ptp(self._corners, axis=0)) if camera.parallel else 0.0
         for surface in sorted(surfaces, key=lambda each: float((np.asarray(each.points) @ camera.towards).mean())):
@@ -615,11 +536,8 @@ class Scene:
             opacity = strength * (1.0 - np.clip(np.asarray(surface.depth), 0.0, 1.0))
             shade = np.column_stack([np.tile(WALL_COLOUR, (len(points), 1)), opacity]).astype(np.uint8)
             options: dict[str, Any] = {"reset_camera": False, "render": False, "lighting": False}
-            actors.append(self._plotter.add_mesh(mesh, scalars=shade, rgb=True, **options))
-            actors[-1].ForceTranslucentOn()
-            if len(surface.edge):
-                actors.append(self._add(Layer(points, np.asarray(surface.edge), EDGE_COLOUR, 1.8), camera))
-        return actors
+            self._plotter.add_mesh(mesh, scalars=shade, rgb=True, **options).ForceTranslucentOn()
+            self._add(Layer(points, np.asarray(surface.edge), EDGE_COLOUR, 1.8), camera)
 
 
 def _width(count: int, lengths: np.ndarray, shortest: float, unit: float) -> float:

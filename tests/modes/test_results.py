@@ -18,7 +18,7 @@ from pfem_petsc.errors import EarlyStop, InputError
 from pfem_petsc.modes import find as choice
 from pfem_petsc.output.integrity import examine
 from pfem_petsc.output.result import open_result
-from pfem_petsc.post.motion import ModeFrames
+from pfem_petsc.post.motion import mode_frames
 from pfem_petsc.post.render import render_modes
 
 
@@ -200,7 +200,7 @@ def test_initial_velocities_without_time_are_refused(key):
 
 def test_frames_of_modes(finished):
     with open_result(finished) as result:
-        frames = ModeFrames(result, [7, 8], period=4)
+        frames = mode_frames(result, [7, 8], period=4)
         assert len(frames.times) == 8
         rest = result.positions(-1)
         assert frames.positions(0) == pytest.approx(rest)
@@ -210,9 +210,9 @@ def test_frames_of_modes(finished):
         assert np.linalg.norm(moved, axis=1).max() == pytest.approx(0.1 * np.linalg.norm([0.1, 0.1, 0.2]))
         assert frames.caption(5) == f"mode 8: {result.modes.frequency[7]:.6g} Hz"
         with pytest.raises(InputError, match="mode 9 does not exist"):
-            ModeFrames(result, [9])
+            mode_frames(result, [9])
         with pytest.raises(InputError, match="too few"):
-            ModeFrames(result, None, period=3)
+            mode_frames(result, None, period=3)
 
 
 def test_pictures_of_modes(tmp_path, finished):

@@ -11,7 +11,7 @@ from PIL import Image
 
 from pfem_petsc.errors import InputError
 from pfem_petsc.output.units import LOAD_FACTOR
-from pfem_petsc.post.motion import Motion, Resampled
+from pfem_petsc.post.motion import Motion, resampled
 from pfem_petsc.post.page import Page
 from pfem_petsc.post.render import Options, render
 from pfem_petsc.post.scene import cameras
@@ -48,7 +48,7 @@ def test_slow_motion_is_between_snapshots(tmp_path, flying):
     assert len(files) == 21 and "21 frames last 1.1 s" in told[0] and "50 times slower" in told[0]
     half = 0.5 * (flying.times[3] + flying.times[4])
     mean = 0.5 * (flying.positions(3) + flying.positions(4))
-    slow = Resampled(flying, np.array([half, 1.0]))
+    slow = resampled(flying, np.array([half, 1.0]))
     assert slow.positions(0) == pytest.approx(mean, abs=1e-12)
     assert (slow.positions(1) == flying.positions(12)).all()
 

@@ -84,7 +84,7 @@ VIEWS = pytest.mark.parametrize("view", ["xy", (0.0, 0.0, 1.0)], ids=["parallel"
 def test_tubes_have_their_radius(view, count):
     """A bar of radius r across the view is 2 r wide and l + 2 r long, with round ends; as one of many, without."""
     points, radius, size = np.array([[-0.5, 0, 0], [0.5, 0, 0.0]]), 0.1, (400, 300)
-    camera, style = camera_of(0.5 * CUBE, view, 4 / 3), Style(True, np.full(count, radius), nodes=False)
+    camera, style = camera_of(0.5 * CUBE, view, 4 / 3), Style(np.full(count, radius), nodes=False)
     picture = picture_of(points, np.tile([[0, 1]], (count, 1)), np.full((count, 3), 90), camera, size, style)
     rows, columns = (picture.min(axis=2) < 250).nonzero()
     scale, ends = size[1] / (2 * camera.half_height), 1.0 if count <= 20_000 else 0.0
@@ -99,7 +99,7 @@ def test_what_is_nearer_hides(view):
     """Two crossed bars in both orders, a red one in front."""
     points = np.array([[-1, 0, 0.1], [1, 0, 0.1], [0, -1, -0.1], [0, 1, -0.1]], dtype=float)
     red, blue = (200, 0, 0), (0, 0, 200)
-    camera, style = camera_of(CUBE, view), Style(True, np.full(2, 0.15), nodes=False)
+    camera, style = camera_of(CUBE, view), Style(np.full(2, 0.15), nodes=False)
     for bars, colours in (([[0, 1], [2, 3]], (red, blue)), ([[2, 3], [0, 1]], (blue, red))):
         middle = picture_of(points, bars, colours, camera, (160, 160), style)[80, 80]
         assert middle[0] > middle[2] + 60
@@ -139,7 +139,7 @@ def test_ghost_stays_where_the_structure_was(tmp_path, flying):
 def test_what_is_added_has_its_depth(view):
     """A trajectory or ghost in front of a bar is seen, one behind it hidden; at the same place, the shift decides."""
     points = np.array([[-1.0, 0.0, 0.0], [1.0, 0.0, 0.0]])
-    camera, style = camera_of(CUBE, view), Style(False, bar_width=8.0, nodes=False)
+    camera, style = camera_of(CUBE, view), Style(bar_width=8.0, nodes=False)
     for height, sign, seen in ((0.8, 0.0, True), (-0.8, 0.0, False), (0.0, 1.0, True), (0.0, -1.0, False)):
         places = np.array([[0.0, -1.0, height], [0.0, 1.0, height]])
 

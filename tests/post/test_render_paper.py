@@ -16,7 +16,7 @@ from pfem_petsc.output.table import Table
 from pfem_petsc.output.units import POINT
 from pfem_petsc.post.members import draw_members
 from pfem_petsc.post.motion import Actions, Motion
-from pfem_petsc.post.page import ColourScale, Page, inset_room
+from pfem_petsc.post.page import ColourScale, Page
 from pfem_petsc.post.render import Film, Options, instants
 from pfem_petsc.post.scene import Style, cameras
 
@@ -38,7 +38,7 @@ def test_bars_have_the_colours_of_the_scale_wherever_they_are(view, count):
         [[-0.8, 0.6, 0.9], [0.8, 0.6, 0.9], [-0.8, 0.0, -0.9], [0.8, 0.0, -0.9], [-0.8, -0.6, -0.4], [0.8, -0.6, 0.4]]
     )
     bars = np.repeat([[0, 1], [2, 3], [4, 5]], count, axis=0)
-    camera, style = camera_of(BOX, view), Style(True, np.full(len(bars), 0.1), nodes=False)
+    camera, style = camera_of(BOX, view), Style(np.full(len(bars), 0.1), nodes=False)
     picture = picture_of(points, bars, np.repeat(colours, count, axis=0), camera, (300, 300), style)
     x, y, _ = projected(camera, points.reshape(3, 2, 3).mean(axis=1), (300, 300))
     for column, row, colour in zip(x.round().astype(int), y.round().astype(int), colours, strict=True):
@@ -50,7 +50,7 @@ def test_bars_have_the_colours_of_the_scale_wherever_they_are(view, count):
 
 def test_rims_leave_thin_bars_their_colour():
     """A bar four pixels wide: its darkest pixel across is at least 70 % of its colour, and crossing bars have edges."""
-    points, style = np.array([[-0.8, 0.0, 0.0], [0.8, 0.0, 0.0]]), Style(False, bar_width=4.0, nodes=False)
+    points, style = np.array([[-0.8, 0.0, 0.0], [0.8, 0.0, 0.0]]), Style(bar_width=4.0, nodes=False)
     picture = picture_of(points, [[0, 1]], [(200, 100, 100)], camera_of(BOX, "xy"), (300, 300), style)
     across = picture[140:160, 150, 0]
     assert (across == 200).any()
@@ -115,12 +115,10 @@ def test_length_scale_is_that_at_mid_depth(tmp_path, flying, view):
     assert min(abs(metres / (10.0 ** np.floor(np.log10(metres) + 0.02)) / k - 1.0) for k in (1, 2, 5)) < 0.02
 
 
-def test_curves_are_beside_what_is_drawn(flying):
-    """Below a wide truss, beside a tall one, and never over the drawings."""
-    assert inset_room((1000, 600), 4.0, 220) == (0, 180)
-    assert inset_room((1000, 600), 0.5, 220) == (270, 0)
-    with pytest.raises(InputError, match="inset needs tiles of 220 x 264 pixels or more, and these have 200 x 600"):
-        inset_room((200, 600), 1.0, 220)
+def test_curves_are_below_what_is_drawn(flying):
+    """Never over the drawings, and not in tiles that are too small."""
+    with pytest.raises(InputError, match="inset needs tiles of 28 x 34 pixels or more, and these have 34 x 31"):
+        Film([flying] * 12, Options(inset="kinetic_energy", size=(160, 120)), print).start((160, 120))
     for points in (np.array([1.0, 0.2, 1.0]), np.array([0.2, 1.0, 1.0])):
         result = SyntheticResult("x/result.vtkhdf", ring()[0] * points, ring()[1], walls=())
         for results in ([result], [result, flying]):
@@ -295,8 +293,8 @@ def test_many_loads_are_thinned_and_counted(tmp_path):
         actions = Actions(result, ["loads"], result.times[:1], bounds)
         tips = actions.arrows(0, points)[1]
         assert actions.notes == [f"symbols at {len(tips)} of 441 loaded nodes"] and 20 <= len(tips) <= 40
-        # as many in each half, and no node farther from one than the diagonal of a cell of 1/5 and half a mesh
-        assert all(np.sum(tips[:, k] < 0.499) == np.sum(tips[:, k] > 0.501) for k in (0, 1))
+        # nearly as many in each half, and no node farther from one than the diagonal of a cell of 1/5 and half a mesh
+        assert all(abs(np.sum(tips[:, k] < 0.499) - np.sum(tips[:, k] > 0.501)) <= 4 for k in (0, 1))
         assert np.linalg.norm(points[:, None] - tips, axis=2).min(axis=1).max() < np.sqrt(2.0) * (0.2 + 0.025)
 
 

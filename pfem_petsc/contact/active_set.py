@@ -248,6 +248,8 @@ class ActiveSet:
         u = self.feasible(u, stiffness)
         for _ in range(_DESCENTS):
             problem.imbalance(u, g)
+            if not model.comm.allreduce(bool(np.isfinite(g).all()), op=MPI.LAND):  # bars have passed through others
+                break
             model.supports.clear(g)
             u = self.feasible(u - g / stiffness[:, None], stiffness)
         return u

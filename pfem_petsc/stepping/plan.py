@@ -342,12 +342,12 @@ def _linear(model: Model, scheme: Scheme, over: float, steps: int) -> LinearChoi
     case = model.case
     impact = model.can_touch or not all(law_of(material).smooth for material in case.material.values())
     solver, unknowns = case.solver, 3 * model.mesh.n_nodes
+    touch = model.self_contact
+    operator = solver.operator if touch is None else touch.operator()
     try:
         block = solver.linear == "auto" and fills_block(model.mesh)
-        touch = model.self_contact
         symmetric = scheme.symmetric and (touch is None or touch.symmetric)
-        demand = Demand(unknowns, over, symmetric, steps, impact, block)
-        choice = choose_linear(solver.linear, solver.operator if touch is None else touch.operator(), demand)
+        choice = choose_linear(solver.linear, operator, Demand(unknowns, over, symmetric, steps, impact, block))
     except InputError as error:
         raise InputError(f"{case.source}: {error}") from error
     if choice.preconditioner == "multigrid" and (model.links or not model.links.symmetric):

@@ -606,6 +606,37 @@ def test_static_contact_and_pairs_in_series(comm, shared_tmp_path):
     assert rows[-1]["self_contact/force"] == pytest.approx((lowered - 0.0003) / soft, rel=1e-3)
 
 
+def test_a_pair_that_presses_bars_through_others_is_told(tmp_path):
+    """Increments are halved up to the force that a contact bears, k R, and the message names the bars."""
+    points = [
+        [-0.5, 0.01, 0.05],
+        [0.5, 0.01, 0.05],
+        [-0.5, 0.01, 0.1],
+        [0.5, 0.01, 0.1],
+        [0.05, -0.5, 0],
+        [0.05, 0.5, 0],
+    ]
+    down = {"motion": [[0.0, 0.0, 0.0, 0.0], [1.0, 0.0, 0.0, -0.3]], "interpolation": "linear"}
+    case = case_of(
+        points,
+        [[0, 1], [2, 3], [4, 5]],
+        node_set={"middle": {"indices": [0, 1]}, "upper": {"indices": [2, 3]}, "lower": {"indices": [4, 5]}},
+        contact_pair=[{"name": "faces", "first": "middle", "second": "upper", "direction": [0, 0, 1.0], "gap": 0.03}],
+        spring=[{"node_set": "middle", "stiffness": [100.0, 100.0, 1.0]}],
+        support=[{"node_set": "upper", "fix": "xyz"} | down, {"node_set": "lower", "fix": "xyz"}],
+        static={"method": "newton", "step": 0.5},
+    )
+    rows = []
+    with (
+        pytest.raises(SimulationFailure, match="no equilibrium found .*: bars 0 and 2 would pass through each other"),
+        Simulation(case, MPI.COMM_SELF, output=tmp_path) as simulation,
+    ):
+        for step in simulation:
+            rows.append(step.row)
+    forces = [row["self_contact/force"] for row in rows if row is not None]
+    assert max(forces) == pytest.approx(YOUNG * AREA * 2.0 * RADIUS, rel=0.05)
+
+
 @pytest.mark.parallel
 def test_supports_in_any_direction(comm, shared_tmp_path):
     """Also along none of the axes, whose rows and columns the derivatives do not have."""

@@ -178,14 +178,14 @@ def rows_of(case, comm, folder, name, **options):
     return rows, x
 
 
-def check_restart(whole, again, comm):
+def check_restart(whole, again, comm, error=1e-12):
     """Compare positions and the last rows to the bit, on several ranks to rounding: MUMPS adds up in the order in which
-    messages arrive."""
+    messages arrive. ``error``: that of energies, which is larger where bars overlap by little."""
     (rows, x), (others, y) = whole, again
     assert 0 < len(others) < len(rows)
-    error = 0.0 if comm.size == 1 else 1e-12
+    error = 0.0 if comm.size == 1 else error
     if comm.rank == 0:
-        np.testing.assert_allclose(y, x, rtol=0.0, atol=error)
+        np.testing.assert_allclose(y, x, rtol=0.0, atol=min(error, 1e-12))
     for key in ("self_contact_energy", "self_contact_dissipation", "elastic_energy"):
         one, other = column(rows, key)[-len(others) :], column(others, key)
         np.testing.assert_allclose(other, one, rtol=error, atol=error * np.abs(one).max())
@@ -575,7 +575,7 @@ def test_a_restart_beside_pairs_continues_to_the_bit(comm, shared_tmp_path):
     part = {"integrator": "generalized_alpha", "step": 1e-5, "end": (step + 0.5) * 1e-5}
     rows_of(on_a_pair(0.3, output=output, time=part), comm, shared_tmp_path, "part")
     again = rows_of(on_a_pair(0.3, output=output), comm, shared_tmp_path, "part", restart=True)
-    check_restart(whole, again, comm)
+    check_restart(whole, again, comm, 1e-8)
 
 
 @pytest.mark.parallel

@@ -478,7 +478,10 @@ class StepProblem:
         internal = self.state.f[: len(u)]
         if weight:
             self.place(u)
-            if not (evaluated and np.array_equal(self.x, self._evaluated)):
+            known = evaluated and np.array_equal(self.x, self._evaluated)
+            if evaluated and self.model.self_contact is not None:  # whose evaluation is collective
+                known = self.model.comm.allreduce(known, op=MPI.LAND)
+            if not known:
                 self._evaluate()
             internal = self.f[: len(u)]
         if not inertia.consistent:
